@@ -1,0 +1,18 @@
+"""Bristle brushes: shapes, and the rollout of a stroke into bristle tracks."""
+
+from jaxbrush.brush.contact import Contact, Surface
+from jaxbrush.brush.forces import stable_dt
+from jaxbrush.brush.rollout import BristleTrack, rollout
+from jaxbrush.brush.shapes import SHAPES, BrushConfig, BrushParams, make_brush
+
+__all__ = [
+    "SHAPES",
+    "BristleTrack",
+    "BrushConfig",
+    "BrushParams",
+    "Contact",
+    "Surface",
+    "make_brush",
+    "rollout",
+    "stable_dt",
+]

@@ -1,0 +1,128 @@
+"""A whole stroke: stylus in, bristle motion and contact force out, in one scan."""
+
+import jax
+import jax.numpy as jnp
+
+from jaxbrush.brush import explicit, guides, implicit, projective
+from jaxbrush.brush.contact import Surface
+from jaxbrush.brush.handle import poses
+from jaxbrush.brush.shapes import BrushConfig, BrushParams
+from jaxbrush.structs import state
+from jaxbrush.stylus import Stroke
+
+
+@state
+class BristleTrack:
+    """The part of the bristles that can touch, at t stamps; m contact nodes (tip last), b bristles.
+
+    time: (t,) [s]. position: (t, m, 3, b) [mm] on the canvas. force: (t, m, b) normal force of
+    the canvas [µN]. velocity: (t, m, 2, b) along the canvas [mm/s]. reaction: (t, 3) force of
+    all bristles on the ferrule [µN]. valid: (t,) False on padding.
+    """
+
+    time: jax.Array
+    position: jax.Array
+    force: jax.Array
+    velocity: jax.Array
+    reaction: jax.Array
+    valid: jax.Array
+
+    @property
+    def contact(self):
+        """(t, m, b) whether a node presses on the canvas at a valid stamp."""
+        return (self.force > 0.0) & self.valid[:, None, None]
+
+
+def _check(config: BrushConfig, params: BrushParams, stroke: Stroke):
+    n, b = config.segments, params.length.shape[-1]
+    if params.rest.shape != (n, 3, b):
+        raise ValueError(
+            f"params.rest has shape {params.rest.shape}: expected {(n, 3, b)} "
+            f"(nodes - 1, 3, bristles) for config.nodes = {config.nodes}"
+        )
+    if params.root.shape != (3, b):
+        raise ValueError(f"params.root has shape {params.root.shape}: expected {(3, b)}")
+    if stroke.position.ndim != 2 or stroke.position.shape[1] != 2:
+        raise ValueError(
+            f"stroke.position has shape {stroke.position.shape}: expected (t, 2); vmap over strokes"
+        )
+    if config.guides > b:
+        raise ValueError(f"config.guides = {config.guides}: expected at most the {b} bristles")
+
+
+def rollout(
+    config: BrushConfig, params: BrushParams, stroke: Stroke, surface: Surface | None = None
+) -> BristleTrack:
+    """Moves the bristles of one brush along one stroke.
+
+    A pure function: jit it, vmap it over strokes or parameters, differentiate it in both. The
+    arrays are in the float type of `params`.
+
+    Args:
+      config: static choices; the integrator, its iterations and substeps.
+      params: the brush, b bristles.
+      stroke: t stamps, from `stylus.resample`; padding stays where the stroke ends.
+      surface: height of what is painted on, or None for the plane z = 0.
+
+    Returns:
+      BristleTrack of the t stamps (the approach is not part of it).
+
+    Raises:
+      ValueError: shapes of `params` and `config` that do not fit, while tracing.
+    """
+    _check(config, params, stroke)
+    pose = poses(params, stroke, config.approach, press=config.press == "depth")
+    if 0 < config.guides < params.length.shape[0]:
+        followed = guides.choose(params, config.guides)
+        track = _rollout(config, guides.take(params, followed), stroke, pose, surface)
+        return guides.follow(
+            config, params, pose.rotation[config.approach :], track, followed, surface
+        )
+    return _rollout(config, params, stroke, pose, surface)
+
+
+def _rollout(config, params, stroke, pose, surface):
+    by_force = config.press == "force"
+    first = jax.tree.map(lambda x: x[0], pose)
+    load = params.press_force * stroke.pressure.astype(params.length.dtype)
+    load = jnp.concatenate([jnp.zeros(config.approach, load.dtype), load])
+
+    if config.integrator in ("quasi_static", "projective"):
+        start = projective.init(config, params, first)
+        if config.integrator == "projective":
+            factor = jax.vmap(lambda dt: projective.dynamic_inverse_factor(config, params, dt))(
+                pose.dt
+            )
+        else:
+            factor = None
+        constant = jnp.asarray(projective.inverse_factor(config.segments), params.length.dtype)
+
+        def body(carry, inputs):
+            pose, q, force = inputs
+            q = constant if q is None else q
+            target = force if by_force else None
+            return projective.step(config, params, carry, pose, q, target, surface)
+
+        _, contact = jax.lax.scan(body, start, (pose, factor, load))
+    else:
+        module = implicit if config.integrator == "implicit_euler" else explicit
+        start = module.init(config, params, first)
+
+        def body(carry, pose):
+            return module.step(config, params, carry, pose, surface)
+
+        _, contact = jax.lax.scan(body, start, pose)
+
+    k = config.approach
+    place = jnp.stack(contact.position, axis=2)
+    path = place[:, :, :2]
+    step = jnp.concatenate([path[1:2] - path[:1], path[1:] - path[:-1]])
+    velocity = step / pose.dt[:, None, None, None]
+    return BristleTrack(
+        time=stroke.time,
+        position=place[k:],
+        force=contact.force[2][k:],
+        velocity=velocity[k:],
+        reaction=contact.reaction[k:],
+        valid=stroke.valid,
+    )

@@ -1,0 +1,32 @@
+"""Settings and fixtures that every test shares."""
+
+import os
+
+WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
+if WORKERS > 1:
+    # Each worker's XLA would otherwise start as many compute threads as there are cores.
+    os.environ.setdefault("PJRT_NPROC", str(max(1, (os.cpu_count() or 1) // WORKERS)))
+
+import jax  # noqa: E402  (the variable above is read when the backend starts)
+import pytest  # noqa: E402
+
+jax.config.update("jax_numpy_rank_promotion", "raise")
+jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    if item.get_closest_marker("gpu") and jax.default_backend() != "gpu":
+        pytest.skip("needs a GPU")
+
+
+@pytest.fixture
+def key() -> jax.Array:
+    """A typed random key, the same in every test."""
+    return jax.random.key(0)
+
+
+@pytest.fixture
+def x64():
+    """Runs the test in double precision: arrays default to float64."""
+    with jax.enable_x64(True):
+        yield
