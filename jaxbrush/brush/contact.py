@@ -22,14 +22,15 @@ class Surface:
 
 @state
 class Contact:
-    """What a stamp leaves: of the m nodes that can touch, m = contact nodes, the tip last.
+    """What a stamp leaves, of the k nodes that are tracked or the m that can touch, tip last.
 
-    position: (m, 3, b) [mm] on the canvas. force: (m, 3, b) of the canvas on the bristle [µN],
-    mean over the stamp. reaction: (3,) of all bristles on the ferrule [µN].
+    position: (k, 3, b) [mm] on the canvas. force: (x, y, z), each (m or k, b), of
+    the canvas on the bristle [µN], mean over the stamp. reaction: (3,) of all bristles on the
+    ferrule [µN].
     """
 
     position: jax.Array
-    force: jax.Array
+    force: tuple
     reaction: jax.Array
 
 
@@ -92,7 +93,7 @@ def coulomb(compliance, free, friction, last):
     radius = jnp.maximum(friction * normal(tx, ty), 1e-6)
     shift = jnp.maximum(drift / radius - (axx + ayy), 0.0)
 
-    def newton(_, shift):
+    def newton(shift):
         d = 1.0 / ((axx + shift) * (ayy + shift) - axy * axy + TINY * xx * yy)
         fx, fy = -((ayy + shift) * bx - axy * by) * d, -((axx + shift) * by - axy * bx) * d
         square = fx * fx + fy * fy + TINY
@@ -100,9 +101,7 @@ def coulomb(compliance, free, friction, last):
         step = square / jnp.maximum(slope, TINY * TINY) * (jnp.sqrt(square) / radius - 1.0)
         return jnp.maximum(shift + step, 0.0)
 
-    # A real loop, so that XLA's CPU back end stores its inputs once and does not recompute the
-    # whole solve for every segment that uses the force.
-    shift = jax.lax.fori_loop(0, 2, newton, shift)
+    shift = newton(newton(shift))
     d = 1.0 / ((axx + shift) * (ayy + shift) - axy * axy + TINY * xx * yy)
     fx, fy = -((ayy + shift) * bx - axy * by) * d, -((axx + shift) * by - axy * bx) * d
     norm = jnp.sqrt(fx * fx + fy * fy + TINY)

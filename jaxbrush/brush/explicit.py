@@ -25,8 +25,8 @@ class NodeState:
 
 def init(config: BrushConfig, params: BrushParams, pose: Pose) -> NodeState:
     """Bristles at rest in the ferrule at `pose`, touching nothing."""
-    rest = turned(pose.rotation, params.rest * params.segment_length(config.segments))
-    node = turned(pose.rotation, params.root) + jnp.cumsum(rest, axis=0)
+    rest = turned(pose.rotation, params.rest * params.segment_length(config.segments)[None, None])
+    node = turned(pose.rotation, params.root)[None] + jnp.cumsum(rest, axis=0)
     zero = jnp.zeros_like(node)
     return NodeState(
         node=node, velocity=zero, rotation=pose.rotation, origin=pose.origin, force=zero
@@ -34,11 +34,11 @@ def init(config: BrushConfig, params: BrushParams, pose: Pose) -> NodeState:
 
 
 def contact_of(config: BrushConfig, node, force, origin, reaction) -> Contact:
-    """The m contact nodes of all-node arrays, as `Contact`."""
-    m = config.contact_nodes
-    place = node[-m:] + origin[:, None]
+    """The tracked nodes of all-node arrays, as `Contact`."""
+    m = config.tracked_nodes
+    place = node[-m:] + origin[None, :, None]
     return Contact(
-        position=tuple(place[:, k] for k in range(3)),
+        position=place,
         force=tuple(force[-m:, k] for k in range(3)),
         reaction=reaction,
     )
@@ -52,7 +52,7 @@ def _touch(config, params, surface, mass, old, new, origin, velocity, dt, t):
     depth = jnp.maximum(height - new[:, 2] - origin[2], 0.0)
     touching = jnp.arange(new.shape[0])[:, None] >= new.shape[0] - config.contact_nodes
     depth = jnp.where(touching, depth, 0.0)
-    slide = new[:, :2] - old[:, :2] + velocity[:2, None] * dt
+    slide = new[:, :2] - old[:, :2] + velocity[None, :2, None] * dt
     length = jnp.sqrt(jnp.sum(slide * slide, axis=1) + 1e-30)
     # |friction| <= mu N, and N dt^2 / m is the depth.
     hold = jnp.minimum(1.0, params.friction * depth / length)
@@ -76,13 +76,13 @@ def step(
     verlet = config.integrator == "verlet"
     mass = node_mass(params, n)
     dt = pose.dt / config.substeps
-    length = params.segment_length(n)
+    length = params.segment_length(n)[None, None]
     base_0, base_1 = turned(state.rotation, params.root), turned(pose.rotation, params.root)
     rest_0, rest_1 = (turned(r, params.rest * length) for r in (state.rotation, pose.rotation))
 
     def elastic(node, t):
         base = base_0 + (base_1 - base_0) * t
-        segment = jnp.concatenate([node[:1] - base, node[1:] - node[:-1]])
+        segment = jnp.concatenate([node[:1] - base[None], node[1:] - node[:-1]])
         return elastic_force(params, segment, rest_0 + (rest_1 - rest_0) * t)
 
     decay = jnp.exp(-params.damping * dt * (0.5 if verlet else 1.0))
@@ -105,7 +105,7 @@ def step(
         reaction = reaction - jnp.sum(force, axis=(0, 2)) / config.substeps
         return (moved, velocity, force, total + push / config.substeps, reaction), None
 
-    velocity = state.velocity - pose.jump[:, None]
+    velocity = state.velocity - pose.jump[None, :, None]
     start = (
         state.node,
         velocity,

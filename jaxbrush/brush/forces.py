@@ -51,7 +51,7 @@ def bending_gradient(stiffness, deviation):
     """
     curvature = differences(deviation)
     weighted = jnp.concatenate([2.0 * curvature[:1], curvature[1:]])
-    return stiffness * following_sum(weighted)
+    return stiffness[None, None] * following_sum(weighted)
 
 
 def tension(stiffness, segment, rest_length):
@@ -62,8 +62,8 @@ def tension(stiffness, segment, rest_length):
     square = jnp.sum(segment * segment, axis=1, keepdims=True)
     alive = square > 0.0
     length = jnp.sqrt(jnp.where(alive, square, 1.0))
-    factor = jnp.where(alive, 1.0 - rest_length / length, 0.0)
-    return stiffness * factor * segment
+    factor = jnp.where(alive, 1.0 - rest_length[None, None] / length, 0.0)
+    return stiffness[None, None] * factor * segment
 
 
 def elastic_force(params: BrushParams, segment, rest):
@@ -93,7 +93,9 @@ def elastic_energy(params: BrushParams, segment, rest):
     bend = 0.5 * params.bending_stiffness(n) * (jnp.sum(square, axis=0) + square[0])
     norm = jnp.sqrt(jnp.sum(segment * segment, axis=1))
     stretch = (
-        0.5 * params.stretch_stiffness(n) * jnp.sum((norm - params.segment_length(n)) ** 2, axis=0)
+        0.5
+        * params.stretch_stiffness(n)
+        * jnp.sum((norm - params.segment_length(n)[None]) ** 2, axis=0)
     )
     return bend + stretch
 
@@ -102,7 +104,8 @@ def node_mass(params: BrushParams, segments: int):
     """Lumped mass of the free nodes, (n, 1, b) [g]; the tip carries half a segment."""
     share = np.ones((segments, 1, 1))
     share[-1] = 0.5
-    return jnp.asarray(share, params.length.dtype) * params.mass * params.segment_length(segments)
+    mass = params.mass * params.segment_length(segments)
+    return jnp.asarray(share, params.length.dtype) * mass[None, None]
 
 
 def stable_dt(params: BrushParams, segments: int):

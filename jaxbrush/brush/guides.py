@@ -41,14 +41,14 @@ def weights(params: BrushParams, index: np.ndarray):
     near, which = jax.lax.top_k(-square.T, min(NEAREST, len(index)))
     share = 1.0 / (1e-6 - near)
     share = share / jnp.sum(share, axis=1, keepdims=True)
-    hot = (which[:, :, None] == jnp.arange(len(index))).astype(root.dtype)
+    hot = (which[:, :, None] == jnp.arange(len(index))[None, None]).astype(root.dtype)
     return jnp.sum(hot * share[:, :, None], axis=1).T
 
 
 def _rest_nodes(config, params, rotation):
-    """Contact nodes of the undeformed brush relative to the handle, (t, m, 3, b)."""
-    segment = params.rest * params.segment_length(config.segments)
-    node = params.root + jnp.cumsum(segment, axis=0)[-config.contact_nodes :]
+    """Tracked nodes of the undeformed brush relative to the handle, (t, m, 3, b)."""
+    segment = params.rest * params.segment_length(config.segments)[None, None]
+    node = params.root[None] + jnp.cumsum(segment, axis=0)[-config.tracked_nodes :]
     return jax.vmap(lambda r: turned(r, node))(rotation)
 
 
@@ -72,6 +72,5 @@ def follow(
         track,
         position=position,
         force=spread(track.force),
-        velocity=spread(track.velocity),
         reaction=track.reaction * (params.length.shape[0] / len(index)),
     )

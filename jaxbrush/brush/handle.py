@@ -56,8 +56,8 @@ def frame(altitude, azimuth, twist):
 
 def _reach(params: BrushParams, rotation):
     """Height of the ferrule at which the lowest undeformed tip just touches, (t,) [mm]."""
-    tip = params.root + params.length * jnp.mean(params.rest, axis=0)
-    down = rotation[:, 2, :, None] * tip
+    tip = params.root + params.length[None] * jnp.mean(params.rest, axis=0)
+    down = rotation[:, 2, :, None] * tip[None]
     return -jnp.min(jnp.sum(down, axis=1), axis=1)
 
 
@@ -101,9 +101,10 @@ def poses(params: BrushParams, stroke: Stroke, approach: int, press: bool = True
 
 
 def turned(rotation, vectors):
-    """`rotation` applied to the second-to-last axis of (..., 3, b), one multiply-add a component."""
+    """`rotation` (3, 3) applied to the second-to-last axis of (..., 3, b)."""
+    column = rotation.reshape((1,) * (vectors.ndim - 2) + (3, 3, 1))
     return (
-        rotation[:, 0, None] * vectors[..., 0:1, :]
-        + rotation[:, 1, None] * vectors[..., 1:2, :]
-        + rotation[:, 2, None] * vectors[..., 2:3, :]
+        column[..., 0, :] * vectors[..., 0:1, :]
+        + column[..., 1, :] * vectors[..., 1:2, :]
+        + column[..., 2, :] * vectors[..., 2:3, :]
     )

@@ -25,11 +25,11 @@ init = explicit.init
 
 
 def _product(a, b):
-    return a[:, 0, None] * b[0] + a[:, 1, None] * b[1] + a[:, 2, None] * b[2]
+    return a[:, 0, None] * b[:1] + a[:, 1, None] * b[1:2] + a[:, 2, None] * b[2:]
 
 
 def _apply(a, x):
-    return a[:, 0] * x[0] + a[:, 1] * x[1] + a[:, 2] * x[2]
+    return a[:, 0] * x[:1] + a[:, 1] * x[1:2] + a[:, 2] * x[2:]
 
 
 def _transpose(a):
@@ -40,7 +40,7 @@ def _inverse(a):
     """Inverse of symmetric positive definite (3, 3, b) by cofactors."""
     rows = [jnp.cross(a[i], a[j], axis=0) for i, j in ((1, 2), (2, 0), (0, 1))]
     det = jnp.sum(a[0] * rows[0], axis=0)
-    return jnp.stack(rows, axis=1) / det
+    return jnp.stack(rows, axis=1) / det[None, None]
 
 
 def solve_pentadiagonal(diagonal, lower, lower2, rhs):
@@ -62,6 +62,7 @@ def solve_pentadiagonal(diagonal, lower, lower2, rhs):
     def down(carry, inputs):
         inverse_2, inverse_1, multiplier_1, y_2, y_1 = carry
         a0, a1, a2, r = inputs
+        a2 = a2[None, None]
         m2 = a2 * inverse_2
         s1 = a1 - a2 * _transpose(multiplier_1)
         m1 = _product(s1, inverse_1)
@@ -89,10 +90,10 @@ def _stretch_blocks(stiffness, segment, length):
     """Positive semidefinite Hessian of the stretch energy by segment, (n, 3, 3, b)."""
     norm = jnp.sqrt(jnp.sum(segment * segment, axis=1, keepdims=True) + 1e-20)
     d = segment / norm
-    across = jnp.maximum(1.0 - length / norm, 0.0)[:, :, None]
+    across = jnp.maximum(1.0 - length[None, None] / norm, 0.0)[:, :, None]
     eye = jnp.eye(3, dtype=segment.dtype)[None, :, :, None]
     both = d[:, :, None] * d[:, None]
-    return stiffness * (both + across * (eye - both))
+    return stiffness[None, None, None] * (both + across * (eye - both))
 
 
 def step(
@@ -111,8 +112,11 @@ def step(
     mass, length = node_mass(params, n), params.segment_length(n)
     dtype = mass.dtype
     dt = pose.dt
-    base, rest = turned(pose.rotation, params.root), turned(pose.rotation, params.rest * length)
-    flight = state.node + dt * (state.velocity - pose.jump[:, None])
+    base, rest = (
+        turned(pose.rotation, params.root),
+        turned(pose.rotation, params.rest * length[None, None]),
+    )
+    flight = state.node + dt * (state.velocity - pose.jump[None, :, None])
     inertia = mass / dt**2
     drag = params.damping * mass / dt
     bend = params.bending_stiffness(n)
@@ -124,11 +128,11 @@ def step(
 
     def band(k):
         entries = np.concatenate([np.zeros(k), np.diag(nodes, -k)])
-        return jnp.asarray(entries[:, None], dtype) * bend
+        return jnp.asarray(entries[:, None], dtype) * bend[None]
 
     def newton(carry, _):
         node, normal, slip = carry
-        segment = jnp.concatenate([node[:1] - base, node[1:] - node[:-1]])
+        segment = jnp.concatenate([node[:1] - base[None], node[1:] - node[:-1]])
         force = elastic_force(params, segment, rest)
         force = force - inertia * (node - flight) - drag * (node - state.node)
         blocks = _stretch_blocks(stretch, segment, length)
@@ -140,7 +144,7 @@ def step(
         gap = node[:, 2] + pose.origin[2] - floor
         active = can_touch & ((normal > 0.0) | (gap < 0.0))
         hold = jnp.where(active, RIGID, 0.0)
-        moved = node[:, :2] - state.node[:, :2] + (pose.velocity[:2] * dt)[:, None]
+        moved = node[:, :2] - state.node[:, :2] + (pose.velocity[:2] * dt)[None, :, None]
         grip = jnp.where(active, params.friction * jnp.maximum(normal, 0.0) / slip, 0.0)
         spring = jnp.stack([grip, grip, hold], axis=1)
         pull = jnp.concatenate([moved, gap[:, None]], axis=1)
@@ -148,8 +152,8 @@ def step(
         change = solve_pentadiagonal(diagonal, lower, band(2), force - spring * pull)
         # A change of direction beyond about half a radian is outside the quadratic model.
         bent = jnp.concatenate([change[:1], change[1:] - change[:-1]])
-        worst = jnp.max(jnp.sqrt(jnp.sum(bent * bent, axis=1) + 1e-30) / length, axis=0)
-        change = change * jnp.minimum(1.0, 0.5 / worst)
+        worst = jnp.max(jnp.sqrt(jnp.sum(bent * bent, axis=1) + 1e-30) / length[None], axis=0)
+        change = change * jnp.minimum(1.0, 0.5 / worst)[None, None]
         push = -spring * (pull + change)
         node = node + change
         normal = jnp.where(active, push[:, 2], 0.0)
@@ -162,7 +166,7 @@ def step(
     (node, _, _), push = jax.lax.scan(newton, start, None, length=config.iterations)
     force = jnp.where((push[-1][:, 2:] > 0.0), push[-1], 0.0)
     velocity = (node - state.node) / dt
-    segment = jnp.concatenate([node[:1] - base, node[1:] - node[:-1]])
+    segment = jnp.concatenate([node[:1] - base[None], node[1:] - node[:-1]])
     reaction = -jnp.sum(elastic_force(params, segment, rest), axis=(0, 2))
     following = NodeState(
         node=node, velocity=velocity, rotation=pose.rotation, origin=pose.origin, force=force

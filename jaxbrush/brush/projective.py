@@ -1,14 +1,17 @@
 """Projective dynamics with one shared inverse: the fast integrators.
 
-Unknowns are the segments, unit vectors times l0, so length is exact. In segment space the
-bending Hessian is one constant tridiagonal matrix, the same for all bristles up to a factor;
-its inverse factor Q (H^-1 = Q^T Q) is shared. One iteration projects the residual force on the
-tangents of the unit spheres, whitens it and the directions of the contact with Q, solves the
-3 x 3 contact problem with friction in that metric, and turns the segments. `quasi_static`
-leaves out inertia (Q is a constant of the node count); `projective` has implicit Euler's.
+Unknowns are the segments, unit vectors times l0, so length is exact. Over segments the bending
+Hessian is one constant tridiagonal matrix, the same for all bristles up to a factor, and stays
+nearly so in tangent frames that turn little from segment to segment; its inverse P = Q^T Q is
+shared. One iteration projects the residual force on the tangents, whitens it and the directions
+of the contact with Q, solves the 3 x 3 contact problem with friction in that metric, and turns
+the segments. Only the geometric stiffness of the axial load is left out of the matrix; the
+fixed point is exact. `quasi_static` leaves out inertia (Q depends on the node count alone);
+`projective` has implicit Euler's.
 
-Everything is a tuple (x, y, z) of (n, b) arrays: XLA's CPU back end vectorises those, and not
-the reshapes that a packed (n, 3, b) array needs before a matrix product.
+Layout and grouping follow XLA's CPU back end: (component, n, b) makes every matrix product one
+batched call and every other operation one vector loop, contact arithmetic is on (b,) rows, and
+what many segments read is stored by ending in a division (cheaper producers are recomputed).
 """
 
 import jax
@@ -21,41 +24,49 @@ from jaxbrush.brush.handle import Pose
 from jaxbrush.brush.shapes import BrushConfig, BrushParams
 from jaxbrush.structs import state
 
-Vec = tuple[jax.Array, jax.Array, jax.Array]
+TINY = 1e-20
+"""[mm^2] keeps the gradient of a segment's direction finite when it has no length."""
 
 
 @state
 class ProjectiveState:
-    """segment: Vec of (n, b) [mm]. force: for x, y, z a list of m (b,) [µN]. point: the same,
-    where the contact nodes were [mm]. node: Vec of (n, b) relative to the handle [mm] and
-    velocity: Vec of (n, b) [mm/s], empty when quasi-static. depth: () extra lowering [mm] of
-    force mode."""
+    """segment: (3, n, b) [mm]. force: for x, y, z a list of m (b,) [µN]. point: the same, where
+    the contact nodes were [mm]. node: (3, n, b) relative to the handle [mm] and velocity:
+    (3, n, b) [mm/s], empty when quasi-static. depth: () extra lowering [mm] of force mode."""
 
-    segment: Vec
+    segment: jax.Array
     force: list
-    point: list
-    node: Vec | tuple
-    velocity: Vec | tuple
+    point: jax.Array
+    node: jax.Array | tuple
+    velocity: jax.Array | tuple
     depth: jax.Array
 
 
-def _dot(matrix, x):
-    return jnp.dot(jnp.asarray(matrix, x.dtype), x, precision=jax.lax.Precision.HIGHEST)
+def _each(matrix, x):
+    """`matrix` (i, j) times each component of x (c, j, b), one batched product, (c, i, b)."""
+    matrix = jnp.broadcast_to(jnp.asarray(matrix, x.dtype), (x.shape[0], *matrix.shape))
+    dimensions = (((2,), (1,)), ((0,), (0,)))
+    return jax.lax.dot_general(matrix, x, dimensions, precision=jax.lax.Precision.HIGHEST)
+
+
+def _column_sums(x):
+    """(c, n, b) to (c, b)."""
+    return _each(np.ones((1, x.shape[1])), x)[:, 0]
 
 
 def _inner(a, b):
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
-def _column_sum(x):
-    # As a product with ones: XLA's CPU reduction over the first axis is several times slower.
-    return _dot(np.ones((1, x.shape[0])), x)[0]
+def _rest(params: BrushParams, rotation, segments: int):
+    """Rest segments turned with the handle, (3, n, b) [mm]."""
+    rest = params.rest * params.segment_length(segments)
+    return sum(rotation[:, k, None, None] * rest[None, :, k] for k in range(3))
 
 
-def _turned(rotation, v) -> Vec:
-    return tuple(
-        rotation[k, 0] * v[0] + rotation[k, 1] * v[1] + rotation[k, 2] * v[2] for k in range(3)
-    )
+def _base(params: BrushParams, rotation):
+    """Clamp points relative to the handle, (3, b) [mm]."""
+    return sum(rotation[:, j, None] * params.root[j] for j in range(3))
 
 
 def _reaches(segments: int, nodes: int) -> np.ndarray:
@@ -63,12 +74,15 @@ def _reaches(segments: int, nodes: int) -> np.ndarray:
     return (np.arange(segments)[:, None] <= np.arange(segments - nodes, segments)).astype(float)
 
 
+def _running(segments: int) -> np.ndarray:
+    return np.tril(np.ones((segments, segments)))
+
+
 def inertia_matrix(segments: int) -> np.ndarray:
     """(n, n) kinetic form over segments, in units of the node mass: C^T M C, C the running sum."""
-    running = np.tril(np.ones((segments, segments)))
     mass = np.ones(segments)
     mass[-1] = 0.5
-    return running.T @ (mass[:, None] * running)
+    return _running(segments).T @ (mass[:, None] * _running(segments))
 
 
 def inverse_factor(segments: int) -> np.ndarray:
@@ -89,20 +103,13 @@ def dynamic_inverse_factor(config: BrushConfig, params: BrushParams, dt):
 def init(config: BrushConfig, params: BrushParams, pose: Pose) -> ProjectiveState:
     """Bristles at rest in the ferrule at `pose`, touching nothing."""
     n, m = config.segments, config.contact_nodes
-    length = params.segment_length(n)
-    segment = _turned(pose.rotation, tuple(params.rest[:, k] * length for k in range(3)))
-    base = _turned(pose.rotation, params.root)
+    segment, base = _rest(params, pose.rotation, n), _base(params, pose.rotation)
     zero = jnp.zeros(params.length.shape, params.length.dtype)
-    reach = _reaches(n, m).T
-    point = []
-    for k in range(3):
-        node = _dot(reach, segment[k])
-        point.append([node[c] + base[k] + pose.origin[k] for c in range(m)])
+    point = _each(_reaches(n, m).T, segment) + (base + pose.origin[:, None])[:, None]
     node, velocity = (), ()
     if config.integrator == "projective":
-        running = np.tril(np.ones((n, n)))
-        node = tuple(_dot(running, segment[k]) + base[k] for k in range(3))
-        velocity = tuple(jnp.zeros_like(x) for x in node)
+        node = _each(_running(n), segment) + base[:, None]
+        velocity = jnp.zeros_like(node)
     return ProjectiveState(
         segment=segment,
         force=[[zero] * m] * 3,
@@ -113,9 +120,36 @@ def init(config: BrushConfig, params: BrushParams, pose: Pose) -> ProjectiveStat
     )
 
 
+def _fold(d):
+    """1 / (1 - d_z) of unit segments (3, n, b): what their tangent frames are built from.
+
+    The frame is that of the least rotation from -z to d: tangents t_k with components
+    delta_ka - fold d_k d_a for a in (x, y), and d_k along z. Neighbours turn little against each
+    other, which keeps the bending Hessian in these frames close to the constant one. A segment
+    that points straight up has no such frame; there the bound keeps it finite.
+    """
+    return 1.0 / jnp.maximum(1.0 - d[2], 1e-3)
+
+
+def _along(d, fold, f):
+    """Components of a vector f (f[0], f[1], f[2], each (n, b)) along the tangents, (2, n, b)."""
+    mixed = f[2] - fold * (d[0] * f[0] + d[1] * f[1])
+    # A select on the first axis instead of a stack, which would be built branch by branch.
+    first = jnp.asarray([1.0, 0.0], d.dtype)[:, None, None]
+    return d[:2] * mixed + first * f[0] + (1.0 - first) * f[1]
+
+
+def _tangents(d, fold):
+    """The tangents, (2, 3, n, b)."""
+    flat = np.eye(2)[:, :, None, None].astype(d.dtype) - (fold * d[:2])[:, None] * d[None, :2]
+    return jnp.concatenate([flat, d[:2, None]], axis=1)
+
+
 def _worst_contact(gap, normal):
     """Share (1 or 0) of each contact node in this iteration, a list of m (b,): the node that
     breaks its condition most, the tip on a draw."""
+    if len(gap) == 1:
+        return [1.0]
     broken = [
         jnp.where(f > 0.0, jnp.abs(g), jnp.maximum(-g, 0.0)) + 1e-9 * c
         for c, (g, f) in enumerate(zip(gap, normal, strict=True))
@@ -165,77 +199,65 @@ def step(
     n, m = config.segments, config.contact_nodes
     dtype = params.length.dtype
     reach = _reaches(n, m)
-    length = params.segment_length(n)
-    stiffness = params.bending_stiffness(n)
+    length, stiffness = params.segment_length(n), params.bending_stiffness(n)
     soft = n / params.stretch_stiffness(n)
     by_length, by_stiffness = 1.0 / length, 1.0 / stiffness
     bending = bending_matrix(n)
+    inverse = jnp.matmul(factor.T, factor, precision=jax.lax.Precision.HIGHEST)
     dynamic = config.integrator == "projective"
 
-    rest = _turned(pose.rotation, tuple(params.rest[:, k] * length for k in range(3)))
-    base = _turned(pose.rotation, params.root)
-    base = tuple(base[k] + pose.origin[k] for k in range(3))
+    rest = _rest(params, pose.rotation, n)
+    offset = _base(params, pose.rotation)
+    base = offset + pose.origin[:, None]
     e, force, depth = state.segment, state.force, state.depth
     if dynamic:
-        running = np.tril(np.ones((n, n)))
-        share = jnp.asarray(np.append(np.ones(n - 1), 0.5)[:, None], dtype)
-        mass = share * params.mass * length
+        mass = jnp.asarray(np.append(np.ones(n - 1), 0.5)[:, None], dtype) * params.mass * length
         # Free flight in the handle's frame; its acceleration enters as the jump of velocity.
-        flight = tuple(
-            state.node[k] + pose.dt * (state.velocity[k] - pose.jump[k]) for k in range(3)
-        )
+        flight = state.node + pose.dt * (state.velocity - pose.jump[:, None, None])
+        clamp = offset[:, None]
 
-    def places(e, depth):
-        """Contact nodes on the canvas, a Vec of lists of m (b,)."""
-        out = []
-        for k in range(3):
-            node = _dot(reach.T, e[k])
-            out.append([node[c] + (base[2] - depth if k == 2 else base[k]) for c in range(m)])
-        return out
+    def places(e, depth, count):
+        """The last `count` nodes on the canvas, (3, count, b)."""
+        low = jnp.asarray([0.0, 0.0, 1.0], dtype)[:, None] * depth
+        return _each(_reaches(n, count).T, e) + (base - low)[:, None]
 
     def spread(rows):
         """Force on the contact nodes, m of (b,), to the segments they pull on, (n, b)."""
         return sum(jnp.asarray(reach[:, c : c + 1], dtype) * rows[c] for c in range(m))
 
     for _ in range(config.iterations):
-        place = places(e, depth)
-        gap = [place[2][c] - surface_height(surface, place[0][c], place[1][c]) for c in range(m)]
-        d = tuple(x * by_length for x in e)
-        f = tuple(spread(force[k]) - stiffness * _dot(bending, e[k] - rest[k]) for k in range(3))
-        if dynamic:
-            node = tuple(_dot(running, e[k]) + base[k] - pose.origin[k] for k in range(3))
-            pull = tuple(
-                mass
-                / pose.dt
-                * ((node[k] - flight[k]) / pose.dt + params.damping * (node[k] - state.node[k]))
-                for k in range(3)
-            )
-            f = tuple(f[k] - _dot(running.T, pull[k]) for k in range(3))
-        axial = _inner(d, f)
-        whitened = tuple(_dot(factor, f[k] - d[k] * axial) for k in range(3))
-
+        place = places(e, depth, m)
+        floor = surface_height(surface, place[0], place[1])
+        gap = [place[2, c] - floor[c] for c in range(m)]
         chosen = _worst_contact(gap, force[2])
         inside = spread(chosen)
+
+        elastic = _each(bending, e - rest)
+        if dynamic:
+            node = _each(_running(n), e) + clamp
+            drag = params.damping * (node - state.node)
+            pull = mass / pose.dt * ((node - flight) / pose.dt + drag)
+            inertial = _each(_running(n).T, pull)
+        d = e * by_length
+        fold = _fold(d)
+        # Forces over stiffness from here on.
+        f = [by_stiffness * spread(force[k]) - elastic[k] for k in range(3)]
+        if dynamic:
+            f = [f[k] - by_stiffness * inertial[k] for k in range(3)]
+        residual = _along(d, fold, f)
+        whitened = _each(factor, residual)
+        frame = _tangents(d, fold) * inside
+        arm = _each(factor, frame.reshape(6, n, -1)).reshape(2, 3, n, -1)
+        cycled = jnp.concatenate([arm[:, 1:], arm[:, :1]], axis=1)
+        xx, yy, zz = _column_sums(arm[0] * arm[0] + arm[1] * arm[1]) * by_stiffness
+        xy, yz, xz = _column_sums(arm[0] * cycled[0] + arm[1] * cycled[1]) * by_stiffness
+        moved = _column_sums(arm[0] * whitened[0] + arm[1] * whitened[1])
 
         def pick(rows, chosen=chosen):
             return sum(rows[c] * chosen[c] for c in range(m))
 
         fx, fy, fz = (pick(force[k]) for k in range(3))
-        # Columns of the tangent projector, Pi = 1 - d d^T, of the segments above the contact.
-        column = {}
-        for a in range(3):
-            for k in range(a, 3):
-                entry = (1.0 - d[a] * d[a] if a == k else -d[a] * d[k]) * inside
-                column[a, k] = column[k, a] = _dot(factor, entry)
-        arm = [tuple(column[a, k] for k in range(3)) for a in range(3)]
-        moved = [_column_sum(_inner(arm[a], whitened)) * by_stiffness for a in range(3)]
-        bend = [
-            _column_sum(_inner(arm[a], arm[c])) * by_stiffness
-            for a in range(3)
-            for c in range(a, 3)
-        ]
-        xx, xy, xz, yy, yz, zz = bend
-        away = [pick([place[k][c] - state.point[k][c] for c in range(m)]) for k in range(2)]
+        away = [pick([place[k, c] - state.point[k, c] for c in range(m)]) for k in range(2)]
         free = (
             away[0] + moved[0] - xx * fx - xy * fy - xz * fz,
             away[1] + moved[1] - xy * fx - yy * fy - yz * fz,
@@ -248,47 +270,29 @@ def step(
             depth = depth + lower
             free = (free[0], free[1], free[2] - lower)
         new = coulomb(compliance, free, params.friction, (fx, fy))
-        # XLA's CPU back end stores the result of a division and recomputes all cheaper
-        # operations for every segment that reads them: dividing last makes it solve once.
-        kick = [
-            [(x - old) * share * by_length / by_length for share in chosen]
-            for x, old in zip(new, (fx, fy, fz), strict=True)
-        ]
-        force = [[force[k][c] + kick[k][c] for c in range(m)] for k in range(3)]
-        f = tuple(f[k] + spread(kick[k]) for k in range(3))
-        axial = _inner(d, f)
-        turned = tuple(
-            _dot(factor.T, _dot(factor, f[k] - d[k] * axial)) * by_stiffness for k in range(3)
-        )
-        along = _inner(d, turned)
-        e = tuple(e[k] + turned[k] - d[k] * along for k in range(3))
-        scale = length * jax.lax.rsqrt(_inner(e, e) + TINY_SQUARE)
-        e = tuple(x * scale for x in e)
+        kick = [x - old for x, old in zip(new, (fx, fy, fz), strict=True)]
+        force = [[force[k][c] + kick[k] * chosen[c] for c in range(m)] for k in range(3)]
+        push = _along(d, fold, [x / stiffness for x in kick])
+        turn = _each(inverse, residual + inside * push)
+        lift = d[0] * turn[0] + d[1] * turn[1]
+        e = e + jnp.concatenate([turn - fold * d[:2] * lift, lift[None]])
+        e = e * (length / jnp.sqrt(_inner(e, e) + TINY))
 
-    place = places(e, depth)
+    seen = places(e, depth, config.tracked_nodes)
     node, velocity = (), ()
     if dynamic:
-        node = tuple(_dot(running, e[k]) + base[k] - pose.origin[k] for k in range(3))
-        velocity = tuple((node[k] - state.node[k]) / pose.dt for k in range(3))
+        node = _each(_running(n), e) + clamp
+        velocity = (node - state.node) / pose.dt
     next_state = ProjectiveState(
-        segment=e, force=force, point=place, node=node, velocity=velocity, depth=depth
+        segment=e, force=force, point=seen[:, -m:], node=node, velocity=velocity, depth=depth
     )
-    root = tuple(
-        stiffness * (3.0 * (e[k][0] - rest[k][0]) - (e[k][1] - rest[k][1])) for k in range(3)
-    )
-    first = tuple(e[k][0] * by_length for k in range(3))
-    load = tuple(sum(force[k][c] for c in range(m)) for k in range(3))
-    if dynamic:
-        load = tuple(load[k] - jnp.sum(pull[k], axis=0) for k in range(3))
-    tension = _inner(first, tuple(load[k] - root[k] for k in range(3)))
-    reaction = jnp.stack([jnp.sum(root[k] + first[k] * tension) for k in range(3)])
+    root = stiffness * (3.0 * (e[:, 0] - rest[:, 0]) - (e[:, 1] - rest[:, 1]))
+    first = e[:, 0] * by_length
+    load = [sum(force[k]) - (jnp.sum(pull[k], axis=0) if dynamic else 0.0) for k in range(3)]
+    tension = sum(first[k] * (load[k] - root[k]) for k in range(3))
     contact = Contact(
-        position=tuple(jnp.stack(x) for x in place),
+        position=jnp.swapaxes(seen, 0, 1),
         force=tuple(jnp.stack(x) for x in force),
-        reaction=reaction,
+        reaction=jnp.sum(root + first * tension, axis=1),
     )
     return next_state, contact
-
-
-TINY_SQUARE = 1e-20
-"""[mm^2] keeps the gradient of a segment's direction finite when it has no length."""

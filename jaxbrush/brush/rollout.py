@@ -13,19 +13,29 @@ from jaxbrush.stylus import Stroke
 
 @state
 class BristleTrack:
-    """The part of the bristles that can touch, at t stamps; m contact nodes (tip last), b bristles.
+    """The part of the bristles near the canvas, at t stamps; m tracked nodes, tip last.
 
     time: (t,) [s]. position: (t, m, 3, b) [mm] on the canvas. force: (t, m, b) normal force of
-    the canvas [µN]. velocity: (t, m, 2, b) along the canvas [mm/s]. reaction: (t, 3) force of
-    all bristles on the ferrule [µN]. valid: (t,) False on padding.
+    the canvas [µN]. reaction: (t, 3) force of all bristles on the ferrule [µN]. valid: (t,)
+    False on padding.
     """
 
     time: jax.Array
     position: jax.Array
     force: jax.Array
-    velocity: jax.Array
     reaction: jax.Array
     valid: jax.Array
+
+    @property
+    def velocity(self):
+        """(t, m, 2, b) mean velocity along the canvas since the stamp before [mm/s]; the first
+        stamp has that of the second."""
+        path = self.position[:, :, :2]
+        dt = self.time[1:] - self.time[:-1]
+        moving = (dt > 0.0) & self.valid[1:]
+        rate = jnp.where(moving, 1.0 / jnp.where(moving, dt, 1.0), 0.0)
+        velocity = (path[1:] - path[:-1]) * rate[:, None, None, None]
+        return jnp.concatenate([velocity[:1], velocity])
 
     @property
     def contact(self):
@@ -101,28 +111,27 @@ def _rollout(config, params, stroke, pose, surface):
             pose, q, force = inputs
             q = constant if q is None else q
             target = force if by_force else None
-            return projective.step(config, params, carry, pose, q, target, surface)
+            carry, contact = projective.step(config, params, carry, pose, q, target, surface)
+            return carry, (contact.position, contact.force[2], contact.reaction)
 
-        _, contact = jax.lax.scan(body, start, (pose, factor, load))
+        _, seen = jax.lax.scan(body, start, (pose, factor, load))
     else:
         module = implicit if config.integrator == "implicit_euler" else explicit
         start = module.init(config, params, first)
 
         def body(carry, pose):
-            return module.step(config, params, carry, pose, surface)
+            carry, contact = module.step(config, params, carry, pose, surface)
+            return carry, (contact.position, contact.force[2], contact.reaction)
 
-        _, contact = jax.lax.scan(body, start, pose)
+        _, seen = jax.lax.scan(body, start, pose)
 
     k = config.approach
-    place = jnp.stack(contact.position, axis=2)
-    path = place[:, :, :2]
-    step = jnp.concatenate([path[1:2] - path[:1], path[1:] - path[:-1]])
-    velocity = step / pose.dt[:, None, None, None]
+    position, force, reaction = seen
+    above = position.shape[1] - force.shape[1]
     return BristleTrack(
         time=stroke.time,
-        position=place[k:],
-        force=contact.force[2][k:],
-        velocity=velocity[k:],
-        reaction=contact.reaction[k:],
+        position=position[k:],
+        force=jnp.pad(force[k:], ((0, 0), (above, 0), (0, 0))),
+        reaction=reaction[k:],
         valid=stroke.valid,
     )

@@ -16,8 +16,8 @@ HOG_MODULUS = 4e9
 HOG_DENSITY = 1.3e-3
 """[g/mm^3]"""
 AXIAL_SOFTENING = 100.0
-"""Bristles are made this much softer along their length than hair, still 1000 times stiffer than
-in bending: a strain below 0.1 % at the buckling load, and explicit steps 10 times longer."""
+"""Bristles are made this much softer along their length than hair, still far stiffer than in
+bending: a strain below 0.1 % at the buckling load, and explicit steps 10 times longer."""
 
 
 @config
@@ -25,14 +25,17 @@ class BrushConfig:
     """Static choices of a rollout.
 
     nodes: nodes of a bristle, the clamped one included. contact_nodes: how many, from the tip
-    up, can touch. integrator: one of `INTEGRATORS`. iterations: Newton or projection steps a
-    stamp. substeps: explicit steps a stamp. approach: lowering steps before the first stamp.
+    up, can touch; pressed to the full depth at up to 60 degrees of tilt only the tip does.
+    track_nodes: how many, from the tip up, are put out (the contact nodes at least).
+    integrator: one of `INTEGRATORS`. iterations: Newton or projection steps a stamp. substeps:
+    explicit steps a stamp. approach: lowering steps before the first stamp.
     press: "depth" (pressure sets how far the ferrule is lowered) or "force" (pressure sets the
     total normal force). guides: bristles that are simulated, the rest follow them; 0 is all.
     """
 
     nodes: int = 12
-    contact_nodes: int = 3
+    contact_nodes: int = 1
+    track_nodes: int = 3
     integrator: str = "quasi_static"
     iterations: int = 1
     substeps: int = 1
@@ -44,6 +47,7 @@ class BrushConfig:
         for name, least in (
             ("nodes", 3),
             ("contact_nodes", 1),
+            ("track_nodes", 1),
             ("iterations", 1),
             ("substeps", 1),
             ("approach", 0),
@@ -52,11 +56,12 @@ class BrushConfig:
             value = getattr(self, name)
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"BrushConfig.{name} = {value!r}: expected an integer >= {least}")
-        if self.contact_nodes > self.nodes - 1:
-            raise ValueError(
-                f"BrushConfig.contact_nodes = {self.contact_nodes}: "
-                f"expected at most nodes - 1 = {self.nodes - 1}"
-            )
+        for name in ("contact_nodes", "track_nodes"):
+            if getattr(self, name) > self.nodes - 1:
+                raise ValueError(
+                    f"BrushConfig.{name} = {getattr(self, name)}: "
+                    f"expected at most nodes - 1 = {self.nodes - 1}"
+                )
         if self.integrator not in INTEGRATORS:
             raise ValueError(
                 f"BrushConfig.integrator = {self.integrator!r}: expected one of {INTEGRATORS}"
@@ -72,6 +77,10 @@ class BrushConfig:
     @property
     def segments(self) -> int:
         return self.nodes - 1
+
+    @property
+    def tracked_nodes(self) -> int:
+        return max(self.track_nodes, self.contact_nodes)
 
 
 @state
@@ -160,7 +169,7 @@ def make_brush(
     irregularity=1.0,
     modulus=HOG_MODULUS,
     friction=0.25,
-    damping=600.0,
+    damping_ratio=0.5,
     press_depth=5.0,
     press_force=None,
 ) -> BrushParams:
@@ -181,7 +190,7 @@ def make_brush(
         0.06 rad and length 2 % (standard deviations) at 1.
       modulus: Young's modulus [Pa].
       friction: Coulomb coefficient between hair and (paint-lubricated) canvas.
-      damping: [1/s], about half of critical for a hog bristle's first mode.
+      damping_ratio: of the first mode of the longest bristle (92 Hz for hog).
       press_depth: depth at pressure 1 [mm]. press_force: force at pressure 1 [µN]; default is
         that of all bristles as cantilevers bent by `press_depth`.
 
@@ -214,14 +223,16 @@ def make_brush(
     # Slope of a bristle outwards: splay at the ferrule, minus `point` at the tip, plus its own
     # tilt and curl.
     along = jnp.asarray((np.arange(n) + 0.5) / n)[:, None, None]
-    slope = unit * (splay * (1.0 - along) - preset["point"] * along)
-    slope = slope + 0.02 * irregularity * jax.random.normal(tilt, (2, bristles))
-    slope = slope + 0.06 * irregularity * (along - 0.5) * jax.random.normal(curl, (2, bristles))
+    slope = unit[None] * (splay * (1.0 - along) - preset["point"] * along)
+    slope = slope + 0.02 * irregularity * jax.random.normal(tilt, (1, 2, bristles))
+    slope = slope + 0.06 * irregularity * (along - 0.5) * jax.random.normal(curl, (1, 2, bristles))
     rest = jnp.concatenate([slope, jnp.full((n, 1, bristles), -1.0)], axis=1)
     rest = rest / jnp.sqrt(jnp.sum(rest * rest, axis=1, keepdims=True))
 
     area = 0.25 * np.pi * jnp.asarray(diameter, float) ** 2
     bending = modulus * area**2 / (4.0 * np.pi)
+    density = HOG_DENSITY * area
+    first_mode = 3.516 * jnp.sqrt(bending / density) / jnp.asarray(length, float) ** 2
     ones = jnp.ones(bristles)
     if press_force is None:
         press_force = bristles * 3.0 * bending / length**3 * press_depth
@@ -231,8 +242,8 @@ def make_brush(
         length=own_length,
         bending=bending * ones,
         stretch=modulus * area / AXIAL_SOFTENING * ones,
-        mass=HOG_DENSITY * area * ones,
-        damping=jnp.asarray(damping, float),
+        mass=density * ones,
+        damping=2.0 * damping_ratio * first_mode,
         friction=jnp.asarray(friction, float),
         press_depth=jnp.asarray(press_depth, float),
         press_force=jnp.asarray(press_force, float),
