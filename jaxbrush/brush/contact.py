@@ -71,6 +71,9 @@ def coulomb(compliance, free, friction, last):
     """
     xx, xy, xz, yy, yz, zz = compliance
     sx, sy, sz = free
+    touching = sz < 0.0
+    # Solve a harmless problem where nothing touches: the branch not taken must not breed NaNs.
+    sz = jnp.where(touching, sz, -1.0)
     inverse = 1.0 / zz
     axx, axy, ayy = xx - xz * xz * inverse, xy - xz * yz * inverse, yy - yz * yz * inverse
     bx, by = sx - xz * sz * inverse, sy - yz * sz * inverse
@@ -88,7 +91,7 @@ def coulomb(compliance, free, friction, last):
     def normal(tx, ty):
         # Against a steep bristle friction can jam (denominator <= 0); then it sticks instead.
         jam = jnp.maximum(zz + friction * (xz * tx + yz * ty), 0.1 * zz)
-        return jnp.maximum(-sz, 0.0) / jam
+        return -sz / jam
 
     radius = jnp.maximum(friction * normal(tx, ty), 1e-6)
     shift = jnp.maximum(drift / radius - (axx + ayy), 0.0)
@@ -98,7 +101,8 @@ def coulomb(compliance, free, friction, last):
         fx, fy = -((ayy + shift) * bx - axy * by) * d, -((axx + shift) * by - axy * bx) * d
         square = fx * fx + fy * fy + TINY
         slope = (fx * ((ayy + shift) * fx - axy * fy) + fy * ((axx + shift) * fy - axy * fx)) * d
-        step = square / jnp.maximum(slope, TINY * TINY) * (jnp.sqrt(square) / radius - 1.0)
+        slope = jnp.maximum(slope, square / (axx + ayy + shift))
+        step = square / slope * (jnp.sqrt(square) / radius - 1.0)
         return jnp.maximum(shift + step, 0.0)
 
     shift = newton(newton(shift))
@@ -107,8 +111,8 @@ def coulomb(compliance, free, friction, last):
     norm = jnp.sqrt(fx * fx + fy * fy + TINY)
     tx, ty = fx / norm, fy / norm
     z = normal(tx, ty)
-    return (
-        jnp.where(stick, hx, friction * z * tx),
-        jnp.where(stick, hy, friction * z * ty),
-        jnp.where(stick, hz, z),
+    slip = (friction * z * tx, friction * z * ty, z)
+    return tuple(
+        jnp.where(touching, jnp.where(stick, h, f), 0.0)
+        for h, f in zip((hx, hy, hz), slip, strict=True)
     )

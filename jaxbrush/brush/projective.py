@@ -162,16 +162,26 @@ def _worst_contact(gap, normal):
     return [x / total for x in hit]
 
 
-def _lowering(compliance_z, free_z, target, others):
-    """Extra depth at which the frictionless normal forces sum to `target`: Newton on a convex
-    piecewise linear function, () [mm]."""
-    depth = jnp.zeros((), free_z.dtype)
-    stiffness = 1.0 / compliance_z
+def _lowering(normal, compliance_z, target, others):
+    """Extra depth at which the normal forces sum to `target`, by the secant method, () [mm].
+
+    Args:
+      normal: function of the depth () to the normal forces (b,) [µN], rising.
+      compliance_z: (b,) [mm/µN]. target, others: () [µN].
+    """
+    depth = jnp.zeros((), compliance_z.dtype)
+    force = normal(depth)
+    total = jnp.sum(force) + others
+    stiffest = jnp.sum(1.0 / compliance_z)
+    slope = jnp.maximum(jnp.sum(jnp.where(force > 0.0, 1.0 / compliance_z, 0.0)), 0.01 * stiffest)
     for _ in range(4):
-        pressed = depth - free_z > 0.0
-        total = jnp.sum(jnp.where(pressed, (depth - free_z) * stiffness, 0.0)) + others
-        slope = jnp.maximum(jnp.sum(jnp.where(pressed, stiffness, 0.0)), jnp.mean(stiffness))
-        depth = depth + (target - total) / slope
+        next_depth = depth + (target - total) / slope
+        next_total = jnp.sum(normal(next_depth)) + others
+        rise, run = next_total - total, next_depth - depth
+        moved = jnp.abs(run) > 1e-6
+        secant = rise / jnp.where(moved, run, 1.0)
+        slope = jnp.where(moved, jnp.clip(secant, 0.01 * stiffest, 10.0 * stiffest), slope)
+        depth, total = next_depth, next_total
     return depth
 
 
@@ -266,7 +276,12 @@ def step(
         compliance = (xx + soft, xy, xz, yy + soft, yz, zz + soft)
         if target is not None:
             others = sum(jnp.sum(row) for row in force[2]) - jnp.sum(fz)
-            lower = _lowering(compliance[5], free[2], target, others)
+
+            def normal(lower, free=free, compliance=compliance, last=(fx, fy)):
+                lowered = (free[0], free[1], free[2] - lower)
+                return coulomb(compliance, lowered, params.friction, last)[2]
+
+            lower = _lowering(normal, compliance[5], target, others)
             depth = depth + lower
             free = (free[0], free[1], free[2] - lower)
         new = coulomb(compliance, free, params.friction, (fx, fy))
