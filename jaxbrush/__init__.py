@@ -10,3 +10,17 @@ from jaxbrush.platform import check_jax_version
 __version__ = "0.1.0"
 
 check_jax_version()
+
+from jaxbrush.brush import SHAPES as SHAPES  # noqa: E402
+from jaxbrush.brush import BristleTrack as BristleTrack  # noqa: E402
+from jaxbrush.brush import BrushConfig as BrushConfig  # noqa: E402
+from jaxbrush.brush import BrushParams as BrushParams  # noqa: E402
+from jaxbrush.brush import Surface as Surface  # noqa: E402
+from jaxbrush.brush import make_brush as make_brush  # noqa: E402
+from jaxbrush.brush import rollout as rollout  # noqa: E402
+from jaxbrush.brush import stable_dt as stable_dt  # noqa: E402
+from jaxbrush.stylus import Stroke as Stroke  # noqa: E402
+from jaxbrush.stylus import make_stroke as make_stroke  # noqa: E402
+from jaxbrush.stylus import random_stroke as random_stroke  # noqa: E402
+from jaxbrush.stylus import resample as resample  # noqa: E402
+from jaxbrush.stylus import transform as transform  # noqa: E402

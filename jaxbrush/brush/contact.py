@@ -43,7 +43,7 @@ def surface_height(surface: Surface | None, x, y):
     v = jnp.clip(y / surface.pixel - 0.5, 0.0, rows - 1.0)
     i = jnp.clip(jnp.floor(v).astype(int), 0, max(rows - 2, 0))
     j = jnp.clip(jnp.floor(u).astype(int), 0, max(columns - 2, 0))
-    fv, fu = v - i, u - j
+    fv, fu = v - i.astype(v.dtype), u - j.astype(u.dtype)
     below, right = jnp.minimum(i + 1, rows - 1), jnp.minimum(j + 1, columns - 1)
     h = surface.height
     top = h[i, j] * (1.0 - fu) + h[i, right] * fu

@@ -86,6 +86,8 @@ def step(
         return elastic_force(params, segment, rest_0 + (rest_1 - rest_0) * t)
 
     decay = jnp.exp(-params.damping * dt * (0.5 if verlet else 1.0))
+    # Damping takes this share of the impulse that a resting node is pushed back by.
+    kept = 0.5 * (1.0 + decay * decay) if verlet else decay
 
     def substep(carry, index):
         node, velocity, force, total, reaction = carry
@@ -103,7 +105,7 @@ def step(
         force = elastic(moved, t)
         velocity = decay * (half + 0.5 * dt * force / mass) if verlet else half
         reaction = reaction - jnp.sum(force, axis=(0, 2)) / config.substeps
-        return (moved, velocity, force, total + push / config.substeps, reaction), None
+        return (moved, velocity, force, total + push / (kept * config.substeps), reaction), None
 
     velocity = state.velocity - pose.jump[None, :, None]
     start = (

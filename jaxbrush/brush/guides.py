@@ -41,7 +41,9 @@ def weights(params: BrushParams, index: np.ndarray):
     near, which = jax.lax.top_k(-square.T, min(NEAREST, len(index)))
     share = 1.0 / (1e-6 - near)
     share = share / jnp.sum(share, axis=1, keepdims=True)
-    hot = (which[:, :, None] == jnp.arange(len(index))[None, None]).astype(root.dtype)
+    hot = (which[:, :, None] == jnp.arange(len(index), dtype=which.dtype)[None, None]).astype(
+        root.dtype
+    )
     return jnp.sum(hot * share[:, :, None], axis=1).T
 
 

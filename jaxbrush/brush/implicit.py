@@ -18,7 +18,7 @@ from jaxbrush.brush.shapes import BrushConfig, BrushParams
 
 RIGID = 1e9
 """Stiffness that holds a touching node on the surface [g/s^2]: 1e4 times a bristle's own."""
-STICK = 1e-5
+STICK = 1e-6
 """Displacement in a stamp up to which friction holds elastically [mm]."""
 
 init = explicit.init
@@ -161,8 +161,9 @@ def step(
         slip = jnp.sqrt(jnp.sum(moved * moved, axis=1) + STICK**2)
         return (node, normal, slip), push
 
-    carried = jnp.sqrt(jnp.sum((pose.velocity[:2] * dt) ** 2) + STICK**2)
-    start = (state.node, state.force[:, 2], jnp.broadcast_to(carried, state.force[:, 2].shape))
+    # Slip starts from how fast the node slid: only that lets a bristle slide under a still handle.
+    slide = (flight - state.node)[:, :2] + (pose.velocity[:2] * dt)[None, :, None]
+    start = (state.node, state.force[:, 2], jnp.sqrt(jnp.sum(slide * slide, axis=1) + STICK**2))
     (node, _, _), push = jax.lax.scan(newton, start, None, length=config.iterations)
     force = jnp.where((push[-1][:, 2:] > 0.0), push[-1], 0.0)
     velocity = (node - state.node) / dt

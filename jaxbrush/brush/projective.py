@@ -60,13 +60,13 @@ def _inner(a, b):
 
 def _rest(params: BrushParams, rotation, segments: int):
     """Rest segments turned with the handle, (3, n, b) [mm]."""
-    rest = params.rest * params.segment_length(segments)
+    rest = params.rest * params.segment_length(segments)[None, None]
     return sum(rotation[:, k, None, None] * rest[None, :, k] for k in range(3))
 
 
 def _base(params: BrushParams, rotation):
     """Clamp points relative to the handle, (3, b) [mm]."""
-    return sum(rotation[:, j, None] * params.root[j] for j in range(3))
+    return sum(rotation[:, j, None] * params.root[j][None] for j in range(3))
 
 
 def _reaches(segments: int, nodes: int) -> np.ndarray:
@@ -136,12 +136,13 @@ def _along(d, fold, f):
     mixed = f[2] - fold * (d[0] * f[0] + d[1] * f[1])
     # A select on the first axis instead of a stack, which would be built branch by branch.
     first = jnp.asarray([1.0, 0.0], d.dtype)[:, None, None]
-    return d[:2] * mixed + first * f[0] + (1.0 - first) * f[1]
+    return d[:2] * mixed[None] + first * f[0][None] + (1.0 - first) * f[1][None]
 
 
 def _tangents(d, fold):
     """The tangents, (2, 3, n, b)."""
-    flat = np.eye(2)[:, :, None, None].astype(d.dtype) - (fold * d[:2])[:, None] * d[None, :2]
+    eye = jnp.eye(2, dtype=d.dtype)[:, :, None, None]
+    flat = eye - (fold[None] * d[:2])[:, None] * d[None, :2]
     return jnp.concatenate([flat, d[:2, None]], axis=1)
 
 
@@ -149,7 +150,7 @@ def _worst_contact(gap, normal):
     """Share (1 or 0) of each contact node in this iteration, a list of m (b,): the node that
     breaks its condition most, the tip on a draw."""
     if len(gap) == 1:
-        return [1.0]
+        return [jnp.ones_like(gap[0])]
     broken = [
         jnp.where(f > 0.0, jnp.abs(g), jnp.maximum(-g, 0.0)) + 1e-9 * c
         for c, (g, f) in enumerate(zip(gap, normal, strict=True))
@@ -221,7 +222,10 @@ def step(
     base = offset + pose.origin[:, None]
     e, force, depth = state.segment, state.force, state.depth
     if dynamic:
-        mass = jnp.asarray(np.append(np.ones(n - 1), 0.5)[:, None], dtype) * params.mass * length
+        mass = (
+            jnp.asarray(np.append(np.ones(n - 1), 0.5)[:, None], dtype)
+            * (params.mass * length)[None]
+        )
         # Free flight in the handle's frame; its acceleration enters as the jump of velocity.
         flight = state.node + pose.dt * (state.velocity - pose.jump[:, None, None])
         clamp = offset[:, None]
@@ -233,7 +237,7 @@ def step(
 
     def spread(rows):
         """Force on the contact nodes, m of (b,), to the segments they pull on, (n, b)."""
-        return sum(jnp.asarray(reach[:, c : c + 1], dtype) * rows[c] for c in range(m))
+        return sum(jnp.asarray(reach[:, c : c + 1], dtype) * rows[c][None] for c in range(m))
 
     for _ in range(config.iterations):
         place = places(e, depth, m)
@@ -246,22 +250,22 @@ def step(
         if dynamic:
             node = _each(_running(n), e) + clamp
             drag = params.damping * (node - state.node)
-            pull = mass / pose.dt * ((node - flight) / pose.dt + drag)
+            pull = mass[None] / pose.dt * ((node - flight) / pose.dt + drag)
             inertial = _each(_running(n).T, pull)
-        d = e * by_length
+        d = e * by_length[None, None]
         fold = _fold(d)
         # Forces over stiffness from here on.
-        f = [by_stiffness * spread(force[k]) - elastic[k] for k in range(3)]
+        f = [by_stiffness[None] * spread(force[k]) - elastic[k] for k in range(3)]
         if dynamic:
-            f = [f[k] - by_stiffness * inertial[k] for k in range(3)]
+            f = [f[k] - by_stiffness[None] * inertial[k] for k in range(3)]
         residual = _along(d, fold, f)
         whitened = _each(factor, residual)
-        frame = _tangents(d, fold) * inside
+        frame = _tangents(d, fold) * inside[None, None]
         arm = _each(factor, frame.reshape(6, n, -1)).reshape(2, 3, n, -1)
         cycled = jnp.concatenate([arm[:, 1:], arm[:, :1]], axis=1)
-        xx, yy, zz = _column_sums(arm[0] * arm[0] + arm[1] * arm[1]) * by_stiffness
-        xy, yz, xz = _column_sums(arm[0] * cycled[0] + arm[1] * cycled[1]) * by_stiffness
-        moved = _column_sums(arm[0] * whitened[0] + arm[1] * whitened[1])
+        xx, yy, zz = _column_sums(arm[0] * arm[0] + arm[1] * arm[1]) * by_stiffness[None]
+        xy, yz, xz = _column_sums(arm[0] * cycled[0] + arm[1] * cycled[1]) * by_stiffness[None]
+        moved = _column_sums(arm[0] * whitened[:1] + arm[1] * whitened[1:])
 
         def pick(rows, chosen=chosen):
             return sum(rows[c] * chosen[c] for c in range(m))
@@ -287,11 +291,11 @@ def step(
         new = coulomb(compliance, free, params.friction, (fx, fy))
         kick = [x - old for x, old in zip(new, (fx, fy, fz), strict=True)]
         force = [[force[k][c] + kick[k] * chosen[c] for c in range(m)] for k in range(3)]
-        push = _along(d, fold, [x / stiffness for x in kick])
-        turn = _each(inverse, residual + inside * push)
+        push = _along(d, fold, [(x / stiffness)[None] for x in kick])
+        turn = _each(inverse, residual + inside[None] * push)
         lift = d[0] * turn[0] + d[1] * turn[1]
-        e = e + jnp.concatenate([turn - fold * d[:2] * lift, lift[None]])
-        e = e * (length / jnp.sqrt(_inner(e, e) + TINY))
+        e = e + jnp.concatenate([turn - d[:2] * (fold * lift)[None], lift[None]])
+        e = e * (length[None] / jnp.sqrt(_inner(e, e) + TINY))[None]
 
     seen = places(e, depth, config.tracked_nodes)
     node, velocity = (), ()
@@ -301,13 +305,13 @@ def step(
     next_state = ProjectiveState(
         segment=e, force=force, point=seen[:, -m:], node=node, velocity=velocity, depth=depth
     )
-    root = stiffness * (3.0 * (e[:, 0] - rest[:, 0]) - (e[:, 1] - rest[:, 1]))
-    first = e[:, 0] * by_length
+    root = stiffness[None] * (3.0 * (e[:, 0] - rest[:, 0]) - (e[:, 1] - rest[:, 1]))
+    first = e[:, 0] * by_length[None]
     load = [sum(force[k]) - (jnp.sum(pull[k], axis=0) if dynamic else 0.0) for k in range(3)]
     tension = sum(first[k] * (load[k] - root[k]) for k in range(3))
     contact = Contact(
         position=jnp.swapaxes(seen, 0, 1),
         force=tuple(jnp.stack(x) for x in force),
-        reaction=jnp.sum(root + first * tension, axis=1),
+        reaction=jnp.sum(root + first * tension[None], axis=1),
     )
     return next_state, contact

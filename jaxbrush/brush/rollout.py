@@ -39,8 +39,8 @@ class BristleTrack:
 
     @property
     def contact(self):
-        """(t, m, b) whether a node presses on the canvas at a valid stamp."""
-        return (self.force > 0.0) & self.valid[:, None, None]
+        """(..., t, m, b) whether a node presses on the canvas at a valid stamp."""
+        return (self.force > 0.0) & self.valid[..., None, None]
 
 
 def _check(config: BrushConfig, params: BrushParams, stroke: Stroke):
