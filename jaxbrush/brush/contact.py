@@ -56,7 +56,7 @@ def coulomb(compliance, free, friction, last):
     Finds the force F and displacement u = free + G F with u_z >= 0, F_z >= 0, u_z F_z = 0 and
     either u_t = 0 and |F_t| <= mu F_z (stick) or F_t = -mu F_z u_t / |u_t| (slip). The vertical
     is eliminated; for a given radius mu F_z the slip force minimises a quadratic on a circle,
-    whose multiplier |u_t| / |F_t| is the root of a monotone equation (two Newton steps of the
+    whose multiplier |u_t| / |F_t| is the root of a monotone equation (three Newton steps of the
     trust-region form). A radial return of the sticking force, the usual short cut, is wrong
     here: a pressed bristle is much stiffer in its own plane than across it.
 
@@ -105,7 +105,8 @@ def coulomb(compliance, free, friction, last):
         step = square / slope * (jnp.sqrt(square) / radius - 1.0)
         return jnp.maximum(shift + step, 0.0)
 
-    shift = newton(newton(shift))
+    for _ in range(3):
+        shift = newton(shift)
     d = 1.0 / ((axx + shift) * (ayy + shift) - axy * axy + TINY * xx * yy)
     fx, fy = -((ayy + shift) * bx - axy * by) * d, -((axx + shift) * by - axy * bx) * d
     norm = jnp.sqrt(fx * fx + fy * fy + TINY)

@@ -44,7 +44,9 @@ class ProjectiveState:
 
 def _each(matrix, x):
     """`matrix` (i, j) times each component of x (c, j, b), one batched product, (c, i, b)."""
-    matrix = jnp.broadcast_to(jnp.asarray(matrix, x.dtype), (x.shape[0], *matrix.shape))
+    # A numpy matrix is tiled now; a traced one at every stamp.
+    tile = np.broadcast_to if isinstance(matrix, np.ndarray) else jnp.broadcast_to
+    matrix = jnp.asarray(tile(matrix, (x.shape[0], *matrix.shape)), x.dtype)
     dimensions = (((2,), (1,)), ((0,), (0,)))
     return jax.lax.dot_general(matrix, x, dimensions, precision=jax.lax.Precision.HIGHEST)
 
@@ -214,7 +216,10 @@ def step(
     soft = n / params.stretch_stiffness(n)
     by_length, by_stiffness = 1.0 / length, 1.0 / stiffness
     bending = bending_matrix(n)
-    inverse = jnp.matmul(factor.T, factor, precision=jax.lax.Precision.HIGHEST)
+    if isinstance(factor, np.ndarray):
+        inverse = factor.T @ factor
+    else:
+        inverse = jnp.matmul(factor.T, factor, precision=jax.lax.Precision.HIGHEST)
     dynamic = config.integrator == "projective"
 
     rest = _rest(params, pose.rotation, n)

@@ -105,7 +105,7 @@ def _rollout(config, params, stroke, pose, surface):
             )
         else:
             factor = None
-        constant = jnp.asarray(projective.inverse_factor(config.segments), params.length.dtype)
+        constant = projective.inverse_factor(config.segments)
 
         def body(carry, inputs):
             pose, q, force = inputs
