@@ -276,7 +276,12 @@ def step(
             return sum(rows[c] * chosen[c] for c in range(m))
 
         fx, fy, fz = (pick(force[k]) for k in range(3))
-        away = [pick([place[k, c] - state.point[k, c] for c in range(m)]) for k in range(2)]
+        # What sticks is the node with its axial give, else friction would creep by that give
+        # every stamp.
+        away = [
+            pick([place[k, c] - state.point[k, c] - soft * state.force[k][c] for c in range(m)])
+            for k in range(2)
+        ]
         free = (
             away[0] + moved[0] - xx * fx - xy * fy - xz * fz,
             away[1] + moved[1] - xy * fx - yy * fy - yz * fz,
