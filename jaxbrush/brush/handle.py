@@ -92,7 +92,9 @@ def poses(params: BrushParams, stroke: Stroke, approach: int, press: bool = True
     origin = jnp.concatenate([place, (reach - depth)[:, None]], axis=1).astype(dtype)
 
     before = stroke.time - jnp.concatenate([stroke.time[:1] - APPROACH_DT, stroke.time[:-1]])
-    stamp_dt = jnp.where(stroke.valid, jnp.maximum(before, SMALLEST_DT), APPROACH_DT)
+    stamp_dt = jnp.where(
+        stroke.valid, jnp.where(before > 0.01 * SMALLEST_DT, before, SMALLEST_DT), APPROACH_DT
+    )
     dt = jnp.concatenate([jnp.full(approach, APPROACH_DT), stamp_dt]).astype(dtype)
     step = jnp.concatenate([origin[1:2] - origin[:1], origin[1:] - origin[:-1]])
     velocity = step / dt[:, None]

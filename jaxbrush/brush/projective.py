@@ -24,6 +24,8 @@ from jaxbrush.brush.handle import Pose
 from jaxbrush.brush.shapes import BrushConfig, BrushParams
 from jaxbrush.structs import state
 
+LARGEST_LOWERING = 0.5
+"""[mm] the handle may move up or down in an iteration when the force is given."""
 TINY = 1e-20
 """[mm^2] keeps the gradient of a segment's direction finite when it has no length."""
 
@@ -165,27 +167,32 @@ def _worst_contact(gap, normal):
     return [x / total for x in hit]
 
 
-def _lowering(normal, compliance_z, target, others):
-    """Extra depth at which the normal forces sum to `target`, by the secant method, () [mm].
+def _lowering(normal, target, others):
+    """Extra depth at which the normal forces sum to `target`, within LARGEST_LOWERING, () [mm].
+
+    Bisection, because stick and slip bend the curve too sharply for Newton or secant steps,
+    then one linear interpolation, which also carries the gradient.
 
     Args:
-      normal: function of the depth () to the normal forces (b,) [µN], rising.
-      compliance_z: (b,) [mm/µN]. target, others: () [µN].
+      normal: function of the depth () to the normal forces (b,) [µN].
+      target, others: () [µN].
     """
-    depth = jnp.zeros((), compliance_z.dtype)
-    force = normal(depth)
-    total = jnp.sum(force) + others
-    stiffest = jnp.sum(1.0 / compliance_z)
-    slope = jnp.maximum(jnp.sum(jnp.where(force > 0.0, 1.0 / compliance_z, 0.0)), 0.01 * stiffest)
-    for _ in range(4):
-        next_depth = depth + (target - total) / slope
-        next_total = jnp.sum(normal(next_depth)) + others
-        rise, run = next_total - total, next_depth - depth
-        moved = jnp.abs(run) > 1e-6
-        secant = rise / jnp.where(moved, run, 1.0)
-        slope = jnp.where(moved, jnp.clip(secant, 0.01 * stiffest, 10.0 * stiffest), slope)
-        depth, total = next_depth, next_total
-    return depth
+
+    def total(depth):
+        return jnp.sum(normal(depth)) + others
+
+    def halve(_, bracket):
+        low, high = bracket
+        middle = 0.5 * (low + high)
+        enough = total(middle) > target
+        return jnp.where(enough, low, middle), jnp.where(enough, middle, high)
+
+    edge = jnp.full((), LARGEST_LOWERING, target.dtype)
+    low, high = jax.lax.stop_gradient(jax.lax.fori_loop(0, 10, halve, (-edge, edge)))
+    at_low, at_high = total(low), total(high)
+    rise = at_high - at_low
+    share = jnp.where(rise > 1e-3, (target - at_low) / jnp.maximum(rise, 1e-3), 0.0)
+    return low + jnp.clip(share, 0.0, 1.0) * (high - low)
 
 
 def step(
@@ -295,7 +302,7 @@ def step(
                 lowered = (free[0], free[1], free[2] - lower)
                 return coulomb(compliance, lowered, params.friction, last)[2]
 
-            lower = _lowering(normal, compliance[5], target, others)
+            lower = _lowering(normal, target, others)
             depth = depth + lower
             free = (free[0], free[1], free[2] - lower)
         new = coulomb(compliance, free, params.friction, (fx, fy))
