@@ -69,6 +69,7 @@ def test_gradient_is_the_finite_difference(x64, key, integrator):
     np.testing.assert_allclose(grad, difference, rtol=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("double", [False, True])
 @pytest.mark.parametrize("integrator", FAST)
 def test_singular_strokes_have_finite_gradients(key, integrator, double):
@@ -145,6 +146,7 @@ def test_collapsed_chain_is_finite(key, collapse):
     assert_finite(jax.jit(jax.grad(lambda e: jnp.sum(end(e)[0].node)))(segment))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("integrator", FAST)
 def test_bristles_without_length_are_finite(key, integrator):
     config, params = brush(key, integrator, iterations=1)
