@@ -2,6 +2,7 @@
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbrush.brush import explicit, guides, implicit, projective
 from jaxbrush.brush.contact import Surface
@@ -81,17 +82,52 @@ def rollout(
       ValueError: shapes of `params` and `config` that do not fit, while tracing.
     """
     _check(config, params, stroke)
-    pose = poses(params, stroke, config.approach, press=config.press == "depth")
+    followed, moved = None, params
     if 0 < config.guides < params.length.shape[0]:
         followed = guides.choose(params, config.guides)
-        track = _rollout(config, guides.take(params, followed), stroke, pose, surface)
-        return guides.follow(
-            config, params, pose.rotation[config.approach :], track, followed, surface
-        )
-    return _rollout(config, params, stroke, pose, surface)
+        moved = guides.take(params, followed)
+    press = config.press == "depth"
+    last = stroke.time.shape[0] - 1
+    solved = np.unique(np.append(np.arange(0, last, config.solve_stride), last))
+    few = jax.tree.map(lambda x: x[solved], stroke)
+    track = _solve(config, moved, few, poses(params, few, config.approach, press), surface)
+    if len(solved) <= last:
+        handle = poses(params, stroke, 0, press).origin[:, :2]
+        track = _between(track, stroke, handle, solved, config.solve_stride)
+    if followed is None:
+        return track
+    rotation = poses(params, stroke, 0, press).rotation
+    return guides.follow(config, params, rotation, track, followed, surface)
 
 
-def _rollout(config, params, stroke, pose, surface):
+def _between(track, stroke, handle, solved, stride):
+    """The track at every stamp of `stroke` from the track at the stamps `solved`, linear in what
+    the bristles do against the handle (t, 2), which itself is exact at every stamp."""
+    first, count = solved[:-1], len(solved) - 1
+    share = np.arange(stride)[None] / (solved[1:] - first)[:, None]
+    stamps = stroke.time.shape[0]
+    apart = stamps - count * stride
+
+    def fill(x):
+        tail = (1,) * (x.ndim - 1)
+        weight = jnp.asarray(share, x.dtype).reshape(count, stride, *tail)
+        between = x[:-1, None] + weight * (x[1:, None] - x[:-1, None])
+        between = between.reshape(count * stride, *x.shape[1:])[:stamps]
+        return jnp.concatenate([between, x[-1:]]) if apart > 0 else between
+
+    def along(x):
+        return jnp.pad(x, ((0, 0), (0, 1)))[:, None, :, None].astype(track.position.dtype)
+
+    return BristleTrack(
+        time=stroke.time,
+        position=fill(track.position - along(handle[solved])) + along(handle),
+        force=fill(track.force),
+        reaction=fill(track.reaction),
+        valid=stroke.valid,
+    )
+
+
+def _solve(config, params, stroke, pose, surface):
     by_force = config.press == "force"
     first = jax.tree.map(lambda x: x[0], pose)
     load = params.press_force * stroke.pressure.astype(params.length.dtype)

@@ -28,8 +28,9 @@ class BrushConfig:
     up, can touch; pressed to the full depth at up to 60 degrees of tilt only the tip does.
     track_nodes: how many, from the tip up, are put out (the contact nodes at least).
     integrator: one of `INTEGRATORS`. iterations: Newton or projection steps a stamp. substeps:
-    explicit steps a stamp. approach: lowering steps before the first stamp.
-    press: "depth" (pressure sets how far the ferrule is lowered) or "force" (pressure sets the
+    explicit steps a stamp. stride: stamps from one solve to the next, those between are interpolated
+    along the handle's path; None is 2 when quasi-static, else 1. approach: lowering steps before
+    the first stamp. press: "depth" (pressure sets how far the ferrule is lowered) or "force" (pressure sets the
     total normal force). guides: bristles that are simulated, the rest follow them; 0 is all.
     """
 
@@ -39,6 +40,7 @@ class BrushConfig:
     integrator: str = "quasi_static"
     iterations: int = 1
     substeps: int = 1
+    stride: int | None = None
     approach: int = 8
     press: str = "depth"
     guides: int = 0
@@ -50,10 +52,13 @@ class BrushConfig:
             ("track_nodes", 1),
             ("iterations", 1),
             ("substeps", 1),
+            ("stride", 1),
             ("approach", 0),
             ("guides", 0),
         ):
             value = getattr(self, name)
+            if name == "stride" and value is None:
+                continue
             if not isinstance(value, int) or value < least:
                 raise ValueError(f"BrushConfig.{name} = {value!r}: expected an integer >= {least}")
         for name in ("contact_nodes", "track_nodes"):
@@ -77,6 +82,10 @@ class BrushConfig:
     @property
     def segments(self) -> int:
         return self.nodes - 1
+
+    @property
+    def solve_stride(self) -> int:
+        return self.stride or (2 if self.integrator == "quasi_static" else 1)
 
     @property
     def tracked_nodes(self) -> int:
