@@ -87,17 +87,21 @@ def rollout(
         followed = guides.choose(params, config.guides)
         moved = guides.take(params, followed)
     press = config.press == "depth"
-    last = stroke.time.shape[0] - 1
-    solved = np.unique(np.append(np.arange(0, last, config.solve_stride), last))
+    solved = solved_stamps(stroke.time.shape[0], config.solve_stride)
     few = jax.tree.map(lambda x: x[solved], stroke)
     track = _solve(config, moved, few, poses(params, few, config.approach, press), surface)
-    if len(solved) <= last:
+    if len(solved) < stroke.time.shape[0]:
         handle = poses(params, stroke, 0, press).origin[:, :2]
         track = _between(track, stroke, handle, solved, config.solve_stride)
     if followed is None:
         return track
     rotation = poses(params, stroke, 0, press).rotation
     return guides.follow(config, params, rotation, track, followed, surface)
+
+
+def solved_stamps(stamps: int, stride: int) -> np.ndarray:
+    """Indices of the stamps that are solved: every `stride`-th, and the last."""
+    return np.unique(np.append(np.arange(0, stamps - 1, stride), stamps - 1))
 
 
 def _between(track, stroke, handle, solved, stride):

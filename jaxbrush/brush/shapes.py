@@ -28,10 +28,11 @@ class BrushConfig:
     up, can touch; pressed to the full depth at up to 60 degrees of tilt only the tip does.
     track_nodes: how many, from the tip up, are put out (the contact nodes at least).
     integrator: one of `INTEGRATORS`. iterations: Newton or projection steps a stamp. substeps:
-    explicit steps a stamp. stride: stamps from one solve to the next, those between are interpolated
-    along the handle's path; None is 2 when quasi-static, else 1. approach: lowering steps before
-    the first stamp. press: "depth" (pressure sets how far the ferrule is lowered) or "force" (pressure sets the
-    total normal force). guides: bristles that are simulated, the rest follow them; 0 is all.
+    explicit steps a stamp. stride: stamps from one solve to the next, those between are
+    interpolated along the handle's path; None is 2 when quasi-static, else 1. approach: lowering
+    steps before the first stamp. press: "depth" (pressure sets how far the ferrule is lowered) or
+    "force" (pressure sets the total normal force). guides: bristles that are simulated, the rest
+    follow them; 0 is all.
     """
 
     nodes: int = 12
