@@ -14,10 +14,13 @@ T = TypeVar("T", bound=type)
 
 @dataclass_transform(frozen_default=True)
 def state(cls: T) -> T:
-    """Makes `cls` a frozen dataclass whose fields are all pytree children."""
+    """Makes `cls` a frozen dataclass whose fields are pytree children, except those declared with
+    `metadata={"static": True}`."""
     cls = dataclasses.dataclass(frozen=True)(cls)
-    fields = [f.name for f in dataclasses.fields(cls)]
-    return jax.tree_util.register_dataclass(cls, data_fields=fields, meta_fields=[])
+    fields = dataclasses.fields(cls)
+    static = [f.name for f in fields if f.metadata.get("static")]
+    data = [f.name for f in fields if not f.metadata.get("static")]
+    return jax.tree_util.register_dataclass(cls, data_fields=data, meta_fields=static)
 
 
 @dataclass_transform(frozen_default=True)
