@@ -12,12 +12,13 @@ in reverse from the windows that the forward pass replaced: its cost and memory 
 number of windows, not with the size of the image times the number of stamps.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbrush.raster.exact import LANES
-from jaxbrush.raster.sweeps import Sweeps, before, exit_share, nearest
+from jaxbrush.raster.sweeps import FAR, Sweeps, before, exit_share, nearest
 from jaxbrush.structs import state
 
 SLACK = 1e-2
@@ -45,72 +46,88 @@ def _coverage(sweep: Sweeps, x, y, radius, edge, height):
     return touch * _smoothstep((radius - jnp.sqrt(square + 1e-12)) / edge + 0.5)
 
 
-def _window(sweep, earlier, color, y, x, side, radius, edge, height):
-    """What one sweep does to its window: keep (s, s), add (6, s, s), passes (s, s)."""
-    py = (y + jnp.arange(side, dtype=sweep.x.dtype))[:, None]
-    px = (x + jnp.arange(side, dtype=sweep.x.dtype))[None, :]
-    a = _coverage(sweep, px, py, radius, edge, height)
+def _windows(sweeps, earlier, y, x, side, radius, edge, height):
+    """What sweeps (n, 1, 1) do to windows at y, x (n, 1, 1).
+
+    Returns:
+      keep (n, s, s); add (n, 3, s, s) of coverage, force, time; passes (n, s, s).
+    """
+    index = jnp.arange(side, dtype=sweeps.x.dtype)
+    py, px = y + index[:, None], x + index[None, :]
+    a = _coverage(sweeps, px, py, radius, edge, height)
     old = _coverage(earlier, px, py, radius, edge, height)
-
-    def carried(s):
-        share = exit_share(s, px, py, radius)
-        one = jnp.ones_like(share)
-        values = (one, s.press + share * s.gain, s.time + share * s.span)
-        return jnp.stack([*values, *(one * c for c in color)])
-
-    now, then = carried(sweep), carried(earlier)
     most = jnp.maximum(a, old)
-    keep = (1.0 - most) / (1.0 - old + SLACK)
+    there = a > 0.0
     # Nothing changes where the bristle is gone.
-    keep = jnp.where(a > 0.0, keep, 1.0)
-    add = a * now + ((most - a) - keep * old) * then
-    add = jnp.where(a > 0.0, add, 0.0)
-    return keep, add, most - old
+    keep = jnp.where(there, (1.0 - most) / (1.0 - old + SLACK), 1.0)
+    # Of the layer: by this sweep, and taken back from the one before.
+    now, then = jnp.where(there, a, 0.0), jnp.where(there, most - a - keep * old, 0.0)
+    share = exit_share(sweeps, px, py, radius)
+    back = exit_share(earlier, px, py, radius)
+    force = now * (sweeps.press + share * sweeps.gain)
+    force = force + then * (earlier.press + back * earlier.gain)
+    time = now * (sweeps.time + share * sweeps.span)
+    time = time + then * (earlier.time + back * earlier.span)
+    return keep, jnp.stack([now + then, force, time], axis=1), jnp.where(there, most - old, 0.0)
 
 
 @jax.custom_vjp
-def composite(image, keep, add, corner):
+def composite(image, keep, add, color, corner):
     """Lays windows over an image, one after the other: inside each, image * keep + add.
 
     Args:
-      image: (c, h, w). keep: (n, s, s). add: (n, c, s, s). corner: (n, 2) int y, x.
+      image: (6, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 3, s, s) to
+        coverage, force and time. color: (n, 3), which comes with coverage. corner: (n, 2) int y, x.
 
     Returns:
-      (c, h, w).
+      (6, h, w).
     """
-    return _composite(image, keep, add, corner)[0]
+    return _composite_forward(image, keep, add, color, corner)[0]
 
 
-def _composite(image, keep, add, corner):
-    channels, side = image.shape[0], keep.shape[-1]
+def _run(image, corner, side, change, backwards=False):
+    """Applies `change(i, window)` to each window of an image in turn.
 
-    def lay(image, inputs):
-        keep, add, at = inputs
-        start = (0, at[0], at[1])
-        old = jax.lax.dynamic_slice(image, start, (channels, side, side))
-        return jax.lax.dynamic_update_slice(image, old * keep[None] + add, start), old
+    Returns:
+      (image, (n, c, s, s) the windows as they were before their change).
 
-    return jax.lax.scan(lay, image, (keep, add, corner))
+    The new window is made from the stored one: with two readers of the image, XLA would copy all
+    of it at every step.
+    """
+    count, channels = corner.shape[0], image.shape[0]
+    size = (channels, side, side)
+
+    def step(k, carry):
+        image, seen = carry
+        i = count - 1 - k if backwards else k
+        start = (0, corner[i, 0], corner[i, 1])
+        old = jax.lax.dynamic_slice(image, start, size)
+        seen = jax.lax.dynamic_update_slice(seen, old[None], (i, 0, 0, 0))
+        old = jax.lax.dynamic_slice(seen, (i, 0, 0, 0), (1, *size))[0]
+        return jax.lax.dynamic_update_slice(image, change(i, old), start), seen
+
+    seen = jnp.zeros((count, *size), image.dtype)
+    return jax.lax.fori_loop(0, count, step, (image, seen))
 
 
-def _composite_forward(image, keep, add, corner):
-    image, old = _composite(image, keep, add, corner)
-    return image, (keep, old, corner)
+def _composite_forward(image, keep, add, color, corner):
+    def change(i, old):
+        paint = color[i][:, None, None] * add[i, :1]
+        return old * keep[i][None] + jnp.concatenate([add[i], paint])
+
+    image, old = _run(image, corner, keep.shape[-1], change)
+    return image, (keep, add, color, old, corner)
 
 
 def _composite_backward(saved, slope):
-    keep, old, corner = saved
-    channels, side = slope.shape[0], keep.shape[-1]
-
-    def lift(slope, inputs):
-        keep, old, at = inputs
-        start = (0, at[0], at[1])
-        own = jax.lax.dynamic_slice(slope, start, (channels, side, side))
-        slope = jax.lax.dynamic_update_slice(slope, own * keep[None], start)
-        return slope, (jnp.sum(own * old, axis=0), own)
-
-    slope, (by_keep, by_add) = jax.lax.scan(lift, slope, (keep, old, corner), reverse=True)
-    return slope, by_keep, by_add, np.zeros(corner.shape, jax.dtypes.float0)
+    keep, add, color, old, corner = saved
+    change = lambda i, slope: slope * keep[i][None]  # noqa: E731
+    slope, by = _run(slope, corner, keep.shape[-1], change, backwards=True)
+    by_keep = jnp.sum(by * old, axis=1)
+    by_color = jnp.einsum("ncyx,nyx->nc", by[:, 3:], add[:, 0], precision="highest")
+    by_paint = jnp.einsum("ncyx,nc->nyx", by[:, 3:], color, precision="highest")
+    by_add = jnp.concatenate([by[:, :1] + by_paint[:, None], by[:, 1:3]], axis=1)
+    return slope, by_keep, by_add, by_color, np.zeros(corner.shape, jax.dtypes.float0)
 
 
 composite.defvjp(_composite_forward, _composite_backward)
@@ -125,10 +142,8 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
       height: over which a tip's weight rises [mm].
     """
     reach = radius + 0.5 * edge
-    side = LANES * int(np.ceil((2.0 * reach + longest + 1.0) / LANES))
+    side = int(np.ceil(2.0 * reach + longest + 1.0))
     stamps, count = sweeps.x.shape
-    # The previous touch can reach out of this window only where this sweep does not cover.
-    earlier = before(sweeps)
 
     def first(start, span, size):
         at = jnp.ceil(jax.lax.stop_gradient(jnp.minimum(start, start + span)) - reach)
@@ -137,20 +152,19 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
 
     y, iny = first(sweeps.y, sweeps.ey, shape[0])
     x, inx = first(sweeps.x, sweeps.ex, shape[1])
-    colors = jnp.broadcast_to(color[None], (stamps, count, 3))
-
-    def window(sweep, earlier, color, y, x, inside):
-        parts = _window(sweep, earlier, color, y, x, side, radius, edge, height)
-        keep, add, passed = parts
-        return jnp.where(inside, keep, 1.0), jnp.where(inside, add, 0.0), passed * inside
-
-    flat = lambda tree: jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), tree)  # noqa: E731
-    keep, add, passed = jax.vmap(window)(
-        flat(sweeps), flat(earlier), flat(colors), flat(y), flat(x), flat(iny & inx)
-    )
+    flat = lambda v: v.reshape(-1, *v.shape[2:])  # noqa: E731
+    window = lambda tree: jax.tree.map(lambda v: v.reshape(-1, 1, 1), tree)  # noqa: E731
+    # A window off the image is drawn where it does no harm, without weight.
+    inside = iny & inx
+    visible = lambda s: dataclasses.replace(s, depth=jnp.where(inside, s.depth, -FAR))  # noqa: E731
+    keep, add, passed = _windows(
+        window(visible(sweeps)), window(visible(before(sweeps))), window(y), window(x),
+        side, radius, edge, height,
+    )  # fmt: skip
+    colors = flat(jnp.broadcast_to(color[None], (stamps, count, 3)))
     corner = flat(jnp.stack([y, x], axis=-1)) + side
     padded = (shape[0] + 2 * side, shape[1] + 2 * side)
-    layers = composite(jnp.zeros((6, *padded), keep.dtype), keep, add, corner)
+    layers = composite(jnp.zeros((6, *padded), keep.dtype), keep, add, colors, corner)
     numbers = jax.lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
