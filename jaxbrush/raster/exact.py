@@ -52,9 +52,9 @@ def _corners(sweeps: Sweeps, piece, pieces, radius, side, shape):
     that window lies in it: (y, x, inside)."""
 
     def first(start, span, size):
-        share = 1.0 / pieces
-        a = start + span * (piece * share)
-        b = start + span * ((piece + 1) * share)
+        share = 1.0 / pieces.astype(start.dtype)
+        a = start + span * (share * piece)
+        b = start + span * (share * (piece + 1))
         at = jnp.ceil(jnp.minimum(a, b) - radius)
         # Clipped before it becomes an integer, and by hand: what lies off the image counts as
         # outside instead of being moved in.
@@ -63,13 +63,15 @@ def _corners(sweeps: Sweeps, piece, pieces, radius, side, shape):
 
     y, iny = first(sweeps.y, sweeps.ey, shape[0])
     x, inx = first(sweeps.x, sweeps.ex, shape[1])
-    return y, x, iny & inx & (piece < pieces)
+    return y, x, iny & inx & (piece < pieces.astype(sweeps.x.dtype))
 
 
 def _nearest(sweep: Sweeps, y, x, side):
     """(share, square distance) of a sweep next to the pixels of the window at y, x."""
     index = jnp.arange(side, dtype=sweep.x.dtype)
-    return nearest(sweep, x + index[None, :], y + index[:, None])
+    return nearest(
+        sweep, (x.astype(index.dtype) + index)[None], (y.astype(index.dtype) + index)[:, None]
+    )
 
 
 def _paint_loop(image, offers, corner, live, side, combine):
@@ -130,7 +132,7 @@ def _draw(sweeps: Sweeps, offers_of, shape, radius: float, combine, scatter, pla
         return jax.lax.platform_dependent(image, cpu=loop, default=spread)
 
     numbers = jnp.arange(stamps * count, dtype=jnp.int32).reshape(stamps, count)
-    image = draw(image, sweeps, numbers, 0, pieces)
+    image = draw(image, sweeps, numbers, jnp.zeros((), sweeps.x.dtype), pieces)
 
     further = jnp.max(pieces, axis=1) - 1
     ends = jnp.cumsum(further)
@@ -141,7 +143,7 @@ def _draw(sweeps: Sweeps, offers_of, shape, radius: float, combine, scatter, pla
     def one(carry):
         done, image = carry
         stamp = jnp.sum((ends <= done).astype(jnp.int32))
-        piece = done - (ends[stamp] - further[stamp]) + 1
+        piece = (done - (ends[stamp] - further[stamp]) + 1).astype(sweeps.x.dtype)
         row = lambda x: jax.lax.dynamic_slice_in_dim(x, stamp, 1)  # noqa: E731
         some = jax.tree.map(row, sweeps)
         return done + 1, draw(image, some, row(numbers), piece, row(pieces))
@@ -158,7 +160,6 @@ def latest(sweeps: Sweeps, table, shape, radius: float, platform=None):
       sweeps: (t, b); table: their rows. shape: (h, w). radius: of a bristle [pixels].
       platform: "cpu" draws in a loop, "gpu" by a scatter, None by what runs it.
     """
-
     side = window_side(radius)
 
     def offers_of(numbers, live, piece, pieces):
@@ -186,7 +187,8 @@ def passes(sweeps: Sweeps, table, shape, radius: float, platform=None):
             share, square = _nearest(_row(table, numbers[i]), y, x, side)
             _, earlier = _nearest(_row(old, numbers[i]), y, x, side)
             # Windows of neighbouring pieces overlap; a pixel counts in that of its nearest point.
-            own = jnp.minimum(jnp.floor(share * pieces[i]), pieces[i] - 1) == piece
+            count = pieces[i].astype(share.dtype)
+            own = jnp.minimum(jnp.floor(share * count), count - 1.0) == piece
             new = (square <= radius * radius) & (earlier > radius * radius)
             return (new & own & live[i]).astype(jnp.int32)
 

@@ -53,7 +53,7 @@ def _windows(sweeps, earlier, y, x, side, radius, edge, height):
       keep (n, s, s); add (n, 3, s, s) of coverage, force, time; passes (n, s, s).
     """
     index = jnp.arange(side, dtype=sweeps.x.dtype)
-    py, px = y + index[:, None], x + index[None, :]
+    py, px = y + index[None, :, None], x + index[None, None, :]
     a = _coverage(sweeps, px, py, radius, edge, height)
     old = _coverage(earlier, px, py, radius, edge, height)
     most = jnp.maximum(a, old)
@@ -158,7 +158,10 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
     inside = iny & inx
     visible = lambda s: dataclasses.replace(s, depth=jnp.where(inside, s.depth, -FAR))  # noqa: E731
     keep, add, passed = _windows(
-        window(visible(sweeps)), window(visible(before(sweeps))), window(y), window(x),
+        window(visible(sweeps)),
+        window(visible(before(sweeps))),
+        window(y.astype(sweeps.x.dtype)),
+        window(x.astype(sweeps.x.dtype)),
         side, radius, edge, height,
     )  # fmt: skip
     colors = flat(jnp.broadcast_to(color[None], (stamps, count, 3)))
