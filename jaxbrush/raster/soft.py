@@ -100,7 +100,7 @@ def _run(image, corner, side, change, backwards=False):
     def step(k, carry):
         image, seen = carry
         i = count - 1 - k if backwards else k
-        start = (0, corner[i, 0], corner[i, 1])
+        start = (jnp.zeros((), corner.dtype), corner[i, 0], corner[i, 1])
         old = jax.lax.dynamic_slice(image, start, size)
         seen = jax.lax.dynamic_update_slice(seen, old[None], (i, 0, 0, 0))
         old = jax.lax.dynamic_slice(seen, (i, 0, 0, 0), (1, *size))[0]

@@ -1,0 +1,161 @@
+"""Bristle tracks made by hand, and maps drawn the slow, obvious way, for the raster tests."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbrush.brush import BristleTrack
+from jaxbrush.raster import trajectory_maps
+from jaxbrush.raster.sweeps import TIP_STIFFNESS
+
+STATIC = ("width", "edge", "nodes", "longest")
+draw = jax.jit(trajectory_maps, static_argnames=STATIC)
+
+
+def make_track(path, force=100.0, height=0.0, time=None, valid=None, nodes=1):
+    """A track from the paths (t, 2) or (t, 2, b) [mm] of its tips.
+
+    force [µN] and height [mm] broadcast to (t, b); nodes above the tip are in the air, beside it.
+    """
+    path = np.asarray(path, float)
+    path = path[..., None] if path.ndim == 2 else path
+    t, _, b = path.shape
+    tip = np.concatenate([path, np.broadcast_to(height, (t, b))[:, None]], axis=1)
+    position = np.stack([tip + [[0.0], [0.7 * k], [0.5 * k]] for k in range(nodes)][::-1], axis=1)
+    load = np.zeros((t, nodes, b))
+    load[:, -1] = force
+    return BristleTrack(
+        time=jnp.asarray(0.01 * np.arange(t) if time is None else time, float),
+        position=jnp.asarray(position, float),
+        force=jnp.asarray(load, float),
+        reaction=jnp.zeros((t, 3)),
+        valid=jnp.asarray(np.ones(t) if valid is None else valid, bool),
+    )
+
+
+def random_track(seed=0, stamps=24, bristles=6, size=5.0, step=0.35, air=0.4):
+    """Tips that wander inside size x size mm, rest, jump, lift off and come down again."""
+    rng = np.random.default_rng(seed)
+    turn = np.cumsum(rng.normal(0.0, 0.8, (stamps, bristles)), axis=0)
+    length = step * rng.uniform(0.0, 1.5, (stamps, bristles))
+    length[rng.random((stamps, bristles)) < 0.15] = 0.0
+    length[rng.random((stamps, bristles)) < 0.06] = 0.5 * size
+    way = np.stack([length * np.cos(turn), length * np.sin(turn)], axis=1)
+    path = rng.uniform(0.0, size, (2, bristles)) + np.cumsum(way, axis=0)
+    # Mirrored at the borders, so that long walks stay inside.
+    path = size - np.abs(np.mod(path, 2.0 * size) - size)
+    lifted = rng.random((stamps, bristles)) < air
+    force = np.where(lifted, 0.0, rng.uniform(5.0, 200.0, (stamps, bristles)))
+    height = np.where(lifted, rng.uniform(0.0, 2.0, (stamps, bristles)), 0.0)
+    time = np.cumsum(rng.uniform(0.001, 0.02, stamps)) + 3.0
+    return make_track(path, force, height, time)
+
+
+def colors(bristles, seed=7):
+    return np.random.default_rng(seed).uniform(0.1, 1.0, (bristles, 3))
+
+
+def padded(track, extra):
+    """The track with `extra` invalid stamps, as far-off numbers that must not be looked at."""
+    junk = {"time": 99.0, "position": 1.0, "force": 50.0, "reaction": 0.0, "valid": False}
+
+    def longer(name, x):
+        return jnp.concatenate([x, jnp.full((extra, *x.shape[1:]), junk[name], x.dtype)])
+
+    return BristleTrack(**{name: longer(name, getattr(track, name)) for name in junk})
+
+
+def stack(tracks):
+    return jax.tree.map(lambda *x: jnp.stack(x), *tracks)
+
+
+def moved(track, by):
+    """The track shifted by (x, y) [mm]."""
+    by = jnp.asarray([*by, 0.0], track.position.dtype)
+    return dataclasses.replace(track, position=track.position + by[None, None, :, None])
+
+
+def leaves(maps):
+    """(name, array) of every map."""
+    return [(f.name, np.asarray(getattr(maps, f.name))) for f in dataclasses.fields(maps)]
+
+
+def assert_same(got, want, window=(slice(None), slice(None))):
+    """Bit for bit, in a window of `want`."""
+    for (name, a), (_, b) in zip(leaves(got), leaves(want), strict=True):
+        np.testing.assert_array_equal(a, b[window] if b.ndim > 1 else b, err_msg=name)
+
+
+def assert_finite(tree):
+    for leaf in jax.tree.leaves(tree):
+        if np.issubdtype(leaf.dtype, np.floating):
+            assert np.all(np.isfinite(np.asarray(leaf)))
+
+
+@dataclasses.dataclass
+class Reference:
+    """Exact maps by loops, and what the comparison needs to know.
+
+    exit: way from the start of its sweep to where the latest bristle left the pixel [pixels].
+    span: length of that sweep [pixels]. rim: whether that pixel is near the sweep's side, where
+    the time of leaving is cut off. tie: several bristles at the latest stamp. unsure: some sweep
+    ends so close to the pixel that rounding may decide.
+    """
+
+    key: np.ndarray
+    passes: np.ndarray
+    pressed: np.ndarray
+    exit: np.ndarray
+    span: np.ndarray
+    rim: np.ndarray
+    tie: np.ndarray
+    unsure: np.ndarray
+
+
+def reference(grid, track, width, tiny=2e-3) -> Reference:
+    """Loops over stamps, bristles (tips only) and pixels in float64: plain geometry."""
+    h, w = grid.shape
+    ys, xs = np.mgrid[:h, :w].astype(float)
+    tip = np.asarray(track.position, float)[:, -1]
+    force = np.asarray(track.force, float)[:, -1]
+    place = (tip[:, :2] - np.asarray(grid.origin, float)[None, :, None]) / grid.pixel - 0.5
+    depth = np.where(force > 0, force / TIP_STIFFNESS, -np.maximum(np.abs(tip[:, 2]), 1e-6))
+    stamps, bristles = force.shape
+    radius = 0.5 * width / grid.pixel
+    out = Reference(*(np.zeros((h, w)) for _ in range(8)))
+    out.key, out.passes = np.zeros((h, w), int), np.zeros((h, w), int)
+    out.tie, out.rim = np.zeros((h, w), bool), np.zeros((h, w), bool)
+    out.unsure = np.zeros((h, w), bool)
+    before = np.zeros((bristles, h, w), bool)
+    for t in range(stamps):
+        for b in range(bristles):
+            s = max(t - 1, 0)
+            d0, d1 = depth[s, b], depth[t, b]
+            covered = np.zeros((h, w), bool)
+            if max(d0, d1) > 0 and bool(track.valid[t]):
+                start, way = place[s, :, b], place[t, :, b] - place[s, :, b]
+                low = 0.0 if d0 > 0 or t == 0 else d0 / (d0 - d1)
+                high = 1.0 if d1 > 0 else d0 / (d0 - d1)
+                length = np.hypot(*way)
+                along = (way / length) if length > 0 else np.array([1.0, 0.0])
+                rx, ry = xs - start[0], ys - start[1]
+                # Along and across the sweep, as in its own frame.
+                u, v = rx * along[0] + ry * along[1], ry * along[0] - rx * along[1]
+                nearest = np.clip(u, low * length, high * length)
+                distance = np.hypot(u - nearest, v)
+                covered = distance <= radius
+                out.unsure |= np.abs(distance - radius) < tiny
+                leave = u + np.sqrt(np.maximum(radius**2 - v**2, 0.0))
+                leave = np.minimum(leave, high * length) if length > 0 else 0.0 * u
+                share = leave / length if length > 0 else 1.0 + 0.0 * u
+                load = force[s, b] + share * (force[t, b] - force[s, b])
+                out.tie[covered] = out.key[covered] > t * bristles
+                out.key[covered] = t * bristles + b + 1
+                out.pressed[covered], out.exit[covered] = load[covered], leave[covered]
+                out.span[covered] = length
+                out.rim[covered] = (v**2 > 0.89 * radius**2)[covered]
+                out.passes += covered & ~before[b]
+            before[b] = covered
+    return out
