@@ -1,0 +1,168 @@
+"""What the paint simulator is made of: grid, constants, and the paint on canvas and brush."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbrush.structs import config, state
+
+SOLVERS = ("zline_pcg", "jacobi_pcg", "chebyshev", "fixed_point")
+REPRESENTATIONS = ("layers", "heightfield")
+
+
+@config
+class PaintConfig:
+    """Static choices of the simulator.
+
+    pixel, layer: cell size along and across the canvas [mm]. layers: cells above the canvas.
+    window: cells along a side of the region that is simulated, around the brush. pigments: how
+    many are mixed. samples: points on each bristle's lowest part. sweeps: points of each along its
+    way from stamp to stamp. viscous, pressure: iterations. solver: of the pressure, one of
+    `SOLVERS`. limiter: second-order lateral fluxes. representation: "layers" (3D) or
+    "heightfield" (one mixed layer).
+    """
+
+    pixel: float = 0.125
+    layer: float = 0.0625
+    layers: int = 16
+    window: int = 64
+    pigments: int = 4
+    samples: int = 4
+    sweeps: int = 2
+    viscous: int = 5
+    pressure: int = 10
+    solver: str = "zline_pcg"
+    limiter: bool = True
+    representation: str = "layers"
+
+    def __post_init__(self):
+        for name, least in (
+            ("layers", 2), ("window", 8), ("pigments", 1), ("samples", 1), ("sweeps", 1),
+            ("viscous", 0), ("pressure", 0),
+        ):  # fmt: skip
+            value = getattr(self, name)
+            if not isinstance(value, int) or value < least:
+                raise ValueError(f"PaintConfig.{name} = {value!r}: expected an integer >= {least}")
+        for name in ("pixel", "layer"):
+            if not getattr(self, name) > 0.0:
+                raise ValueError(f"PaintConfig.{name} = {getattr(self, name)!r}: expected > 0 mm")
+        for name, options in (("solver", SOLVERS), ("representation", REPRESENTATIONS)):
+            if getattr(self, name) not in options:
+                raise ValueError(
+                    f"PaintConfig.{name} = {getattr(self, name)!r}: expected one of {options}"
+                )
+
+    @property
+    def ratio(self) -> float:
+        """(pixel / layer)^2, how much stronger the vertical coupling is."""
+        return (self.pixel / self.layer) ** 2
+
+    @property
+    def cell(self) -> float:
+        """Volume of a cell [mm^3]."""
+        return self.pixel * self.pixel * self.layer
+
+
+@state
+class PaintParams:
+    """Constants of paint and hair, all scalars; lengths in mm, rates per mm of travel.
+
+    Tuned by eye by a prototype at 0.125 mm; stated in physical units so that pixel size, bristle
+    count and stamp interval may change.
+    """
+
+    hair_radius: jax.Array  # of a bristle in the paint [mm]
+    hair_length: jax.Array  # lowest part of a bristle that meets paint [mm]
+    coat_dry: jax.Array  # coat of paint on a dry bristle, times hair_radius
+    coat_full: jax.Array  # what a full tip adds to that, times hair_radius
+    compliance: jax.Array  # share of the way to the paint's surface a bristle rides up
+    tip_volume: jax.Array  # capacity of all tips together [mm^3]
+    reservoir_volume: jax.Array  # capacity of the brush behind them [mm^3]
+    contact_area: jax.Array  # over which all bristles together touch [mm^2]
+    deposit: jax.Array  # [1/mm]
+    squeeze: jax.Array  # [1/mm]
+    pickup: jax.Array  # [1/mm]
+    exchange: jax.Array  # [1/mm]
+    refill: jax.Array  # [1/mm]
+    soak: jax.Array  # travel that contact at rest counts as [mm/s]
+    drag: jax.Array  # Brinkman drag of the hair over viscosity, per hair fraction [1/mm^2]
+    lid: jax.Array  # share of upward flow that the bed of hair stops
+    source: jax.Array  # share of an overfull cell's excess that flows out in a stamp
+    yield_share: jax.Array  # flow below this share of the brush's travel stops
+    relax: jax.Array  # [1/mm] rate at which steep steps of the surface slump near hair
+    relax_slope: jax.Array  # step between neighbouring columns that stands [mm]
+    opacity: jax.Array  # film thickness that hides 63 % of what is under it [mm]
+
+
+def make_params(**changes) -> PaintParams:
+    """The default constants; `changes` by name.
+
+    Raises:
+      ValueError: a name that is not a constant.
+    """
+    values = {
+        "hair_radius": 0.05, "hair_length": 0.9, "coat_dry": 0.2, "coat_full": 5.0,
+        "compliance": 0.4, "tip_volume": 7.5, "reservoir_volume": 63.0, "contact_area": 20.0,
+        "deposit": 12.8, "squeeze": 0.4, "pickup": 4.0, "exchange": 0.48, "refill": 0.8,
+        "soak": 10.0, "drag": 256.0, "lid": 0.9, "source": 1.0, "yield_share": 0.02,
+        "relax": 1.0, "relax_slope": 0.094, "opacity": 0.03,
+    }  # fmt: skip
+    unknown = set(changes) - set(values)
+    if unknown:
+        raise ValueError(f"{sorted(unknown)}: expected names among {sorted(values)}")
+    return PaintParams(**{k: jnp.asarray(v, float) for k, v in (values | changes).items()})
+
+
+@state
+class BrushPaint:
+    """Paint in the brush, by pigment k and bristle b. tip, reservoir: (k, b) [mm^3]."""
+
+    tip: jax.Array
+    reservoir: jax.Array
+
+
+def empty_canvas(config: PaintConfig, shape) -> jax.Array:
+    """Bare canvas (k, z, y, x): share of each cell that each pigment fills, of `shape` (h, w).
+
+    Raises:
+      ValueError: a canvas smaller than the window.
+    """
+    h, w = shape
+    if min(h, w) < config.window:
+        raise ValueError(f"shape = {(h, w)}: expected at least the window, {config.window} cells")
+    return jnp.zeros((config.pigments, config.layers, h, w), float)
+
+
+def load_brush(config: PaintConfig, params: PaintParams, bristles: int, load, mix) -> BrushPaint:
+    """A brush dipped in paint.
+
+    Args:
+      bristles: count b.
+      load: share of the capacity, () or (b,).
+      mix: shares of the pigments, (k,) or (k, b).
+    """
+    mix = jnp.asarray(mix, float)
+    mix = jnp.broadcast_to(mix.reshape(config.pigments, -1), (config.pigments, bristles))
+    share = jnp.broadcast_to(jnp.asarray(load, float), (bristles,))[None] / bristles
+    return BrushPaint(
+        tip=params.tip_volume * share * mix, reservoir=params.reservoir_volume * share * mix
+    )
+
+
+def volume(config: PaintConfig, canvas) -> jax.Array:
+    """(k,) volume of each pigment on a canvas [mm^3]."""
+    return config.cell * jnp.sum(canvas, axis=(1, 2, 3))
+
+
+def height(config: PaintConfig, canvas) -> jax.Array:
+    """(y, x) thickness of the paint [mm]."""
+    return config.layer * jnp.sum(canvas, axis=(0, 1))
+
+
+def weave(shape, pixel: float, depth: float = 0.03, pitch: float = 0.45) -> np.ndarray:
+    """Height of a plain-woven canvas, (y, x) [mm]: threads `pitch` apart, going over and under."""
+    y = (np.arange(shape[0]) + 0.5)[:, None] * pixel / pitch
+    x = (np.arange(shape[1]) + 0.5)[None, :] * pixel / pitch
+    over = 0.5 + 0.5 * np.cos(np.pi * (np.floor(y) + np.floor(x)))
+    across, along = np.abs(np.sin(np.pi * y)), np.abs(np.sin(np.pi * x))
+    return depth * (over * across + (1.0 - over) * along)
