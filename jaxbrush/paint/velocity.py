@@ -137,8 +137,7 @@ def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     pressure, residual = solve(config.solver, matrix, rhs, config.pressure)
     pressure = pressure * liquid
     moved = [
-        face[k] - weights[k] * (_next(pressure, 3 + axis) - pressure)
-        for k, axis in enumerate(AXES)
+        face[k] - weights[k] * (_next(pressure, 3 + axis) - pressure) for k, axis in enumerate(AXES)
     ]
     return jnp.stack(moved), residual
 
