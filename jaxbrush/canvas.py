@@ -86,7 +86,7 @@ def flatten(paint, layer, palette, opacity=0.03, ground=LINEN, mixing: str = "li
     light that they return.
 
     Args:
-      paint: (k, z, y, x) pigment amounts, shares of a cell. layer: height of a cell [mm].
+      paint: (z, k, y, x) pigment amounts, shares of a cell. layer: height of a cell [mm].
       palette: (k, 3) linear RGB of the pigments. opacity: [mm]. ground: (3,) or (y, x, 3).
       mixing: "linear" or "subtractive".
 
@@ -98,11 +98,11 @@ def flatten(paint, layer, palette, opacity=0.03, ground=LINEN, mixing: str = "li
     """
     if mixing not in MIXING:
         raise ValueError(f"mixing = {mixing!r}: expected one of {tuple(MIXING)}")
-    fill = jnp.sum(paint, axis=0) * (layer / opacity)
+    fill = jnp.sum(paint, axis=1) * (layer / opacity)
     above = jnp.flip(jnp.cumsum(jnp.flip(fill, 0), axis=0), 0)
     seen = jnp.exp(-(above - fill)) - jnp.exp(-above)
-    share = paint * (layer / opacity) / jnp.maximum(fill, 1e-12)[None]
-    amount = jnp.moveaxis(jnp.sum(share * seen[None], axis=1), 0, -1)
+    share = paint * (layer / opacity) / jnp.maximum(fill, 1e-12)[:, None]
+    amount = jnp.moveaxis(jnp.sum(share * seen[:, None], axis=0), 0, -1)
     total = jnp.sum(amount, axis=-1, keepdims=True)
     color = MIXING[mixing](amount / jnp.maximum(total, 1e-12), jnp.asarray(palette, paint.dtype))
     bare = jnp.exp(-above[0])[..., None]

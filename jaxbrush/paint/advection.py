@@ -8,32 +8,31 @@ from jaxbrush.paint.state import PaintConfig, PaintParams
 from jaxbrush.paint.velocity import AXES
 
 TINY = 1e-9
+SLOP = 1e-5
+"""Excess or lack of a cell that is left alone, share of a cell."""
 
 
 def _limited(fill, q, n):
     """Van Leer value of `fill` on the faces along axis n, for displacement q [cells]."""
     forward = _next(fill, n) - fill
     backward = fill - _last(fill, n)
-    product = forward * backward
-    slope = jnp.where(product > 0.0, 2.0 * product / (forward + backward + TINY), 0.0)
-    # Slopes are positive or negative together with both differences.
-    slope = jnp.where(
-        product > 0.0, 2.0 * product / jnp.where(forward > 0.0, 1.0, -1.0)
-        / jnp.maximum(jnp.abs(forward + backward), TINY), 0.0,
-    )  # fmt: skip
+    smooth = forward * backward > 0.0
+    # Ends in a division, which XLA stores instead of working it out again for each reader.
+    slope = jnp.where(smooth, 2.0 * forward * backward, 0.0)
+    slope = slope / jnp.where(smooth, forward + backward, 1.0)
     left = fill + 0.5 * (1.0 - q) * slope
     right = _next(fill - 0.5 * (1.0 + q) * slope, n)
     return jnp.where(q > 0.0, left, right)
 
 
 def advect(config: PaintConfig, paint, face):
-    """Moves pigments (k, z, y, x) by face displacements [cells], all below one cell.
+    """Moves pigments (z, k, y, x) by face displacements [cells], all below one cell.
 
     One scalar flux of paint a face carries the pigments in the shares of the cell it leaves, and
     no cell gives more than it has: amounts stay positive, colors in the hull of what was there.
     """
-    fill = jnp.sum(paint, axis=0)
-    fluxes, out = [], 0.0
+    fill = jnp.sum(paint, axis=1)
+    right, left, out = [], [], 0.0
     for k, axis in enumerate(AXES):
         n = 3 + axis
         q = jnp.clip(face[k], -1.0, 1.0)
@@ -42,33 +41,35 @@ def advect(config: PaintConfig, paint, face):
         else:
             value = jnp.where(q > 0.0, fill, _next(fill, n))
         flux = q * value
-        fluxes.append(flux)
-        out = out + jnp.maximum(flux, 0.0) + _last(jnp.maximum(-flux, 0.0), n)
-    scale = jnp.minimum(1.0, fill / jnp.maximum(out, TINY))
-    share = paint / jnp.maximum(fill, TINY)[None]
-    change = 0.0
+        right.append(jnp.maximum(flux, 0.0))
+        left.append(_last(jnp.maximum(-flux, 0.0), n))
+        out = out + right[k] + left[k]
+    # Shares of a cell that leave it, together less than 1 by more than rounding.
+    limit = jnp.maximum(1.000001 * out, jnp.maximum(fill, TINY))
+    moved, stays = 0.0, 1.0
     for k, axis in enumerate(AXES):
-        n = 3 + axis
-        forward = jnp.maximum(fluxes[k], 0.0) * scale
-        back = jnp.maximum(-fluxes[k], 0.0) * _next(scale, n)
-        moved = forward[None] * share - back[None] * _next(share, n + 1)
-        change = change + _last(moved, n + 1) - moved
-    return paint + change
+        m = 4 + axis if k < 2 else 0
+        for leaving, arrive in ((right[k], _last), (left[k], _next)):
+            share = leaving / limit
+            stays = stays - share
+            moved = moved + arrive(paint * share[:, None], m)
+    return paint * stays[:, None] + moved
 
 
 def repack(paint, capacity):
     """Columns without overfull cells and without holes, order kept; the top cell keeps any rest.
 
     Args:
-      paint: (k, z, y, x). capacity: (z, y, x) share of each cell that paint may fill.
+      paint: (z, k, y, x). capacity: (z, y, x) share of each cell that paint may fill.
     """
-    layers = jnp.moveaxis(paint, 1, 0)
+    layers = paint
 
     def push(carry, inputs):
         cell, room = inputs
         cell = cell + carry
         total = jnp.sum(cell, axis=0)
-        keep = jnp.minimum(1.0, room / jnp.maximum(total, TINY))
+        # Within rounding of full is full: paint at rest must not creep by single bits.
+        keep = jnp.where(total > SLOP + room, room / jnp.maximum(total, TINY), 1.0)
         stay = cell * keep[None]
         return cell - stay, stay
 
@@ -78,14 +79,14 @@ def repack(paint, capacity):
     def pull(cell, inputs):
         upper, room = inputs
         total = jnp.sum(cell, axis=0)
-        lack = jnp.maximum(room - total, 0.0)
+        lack = jnp.where(room - total > SLOP, room - total, 0.0)
         have = jnp.sum(upper, axis=0)
         share = jnp.minimum(1.0, lack / jnp.maximum(have, TINY))
         down = upper * share[None]
         return upper - down, cell + down
 
     top, lower = jax.lax.scan(pull, layers[0], (layers[1:], capacity[:-1]))
-    return jnp.moveaxis(jnp.concatenate([lower, top[None]]), 0, 1)
+    return jnp.concatenate([lower, top[None]])
 
 
 def slump(config: PaintConfig, params: PaintParams, paint, near, step):
@@ -94,14 +95,14 @@ def slump(config: PaintConfig, params: PaintParams, paint, near, step):
     Args:
       near: (y, x) 1 where hair is close. step: () travel of the brush [mm].
     """
-    fill = jnp.sum(paint, axis=0)
+    fill = jnp.sum(paint, axis=1)
     height = jnp.sum(fill, axis=0)
     rate = 0.25 * (1.0 - jnp.exp(-4.0 * params.relax * step))
     stands = params.relax_slope / config.layer
     # The paint that can move: the topmost cells of a column, 1.5 deep.
     above = jnp.flip(jnp.cumsum(jnp.flip(fill, 0), axis=0), 0) - fill
     loose = jnp.clip(1.5 - above, 0.0, fill)
-    loose = paint * (loose / jnp.maximum(fill, TINY))[None]
+    loose = paint * (loose / jnp.maximum(fill, TINY))[:, None]
     amount = jnp.maximum(jnp.sum(loose, axis=(0, 1)), TINY)
     h, w = height.shape
     edge_y = (jnp.arange(h) < h - 1).astype(paint.dtype)[:, None]
@@ -114,11 +115,11 @@ def slump(config: PaintConfig, params: PaintParams, paint, near, step):
         moves.append(flux)
         out = out + jnp.maximum(flux, 0.0) + _last(jnp.maximum(-flux, 0.0), n)
     scale = jnp.minimum(1.0, 0.9 * amount / jnp.maximum(out, TINY)) / amount
-    layers = paint.shape[1]
+    layers = paint.shape[0]
     top = jnp.clip(jnp.floor(height), 0.0, layers - 1.0)
     level = jnp.arange(layers, dtype=paint.dtype)[:, None, None]
     landing = (level == top[None]).astype(paint.dtype)
-    column = jnp.sum(loose, axis=1)
+    column = jnp.sum(loose, axis=0)
     gained, lost = 0.0, 0.0
     for n, flux in enumerate(moves):
         forward = jnp.maximum(flux, 0.0) * scale
@@ -127,4 +128,4 @@ def slump(config: PaintConfig, params: PaintParams, paint, near, step):
         lost = lost + forward + _last(here, n)
         arrives = _last(forward[None] * column, n + 1) + here[None] * _next(column, n + 1)
         gained = gained + arrives
-    return paint - loose * lost[None, None] + gained[:, None] * landing[None]
+    return paint - loose * lost[None, None] + gained[None] * landing[:, None]

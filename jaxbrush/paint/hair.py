@@ -10,10 +10,11 @@ from jaxbrush.structs import state
 
 @state
 class Hair:
-    """Points on the lowest part of the bristles in one stamp; s points a bristle, (s, b) or (3, s, b).
+    """Points on the lowest part of the bristles in one stamp, s of each of b bristles.
 
-    place: x, y, z [mm]. motion: displacement over the stamp [mm]. weight: how much a point touches,
-    1 at the tip. travel: (b,) that the tip's contact counts as [mm]. volume: (s, b) [mm^3].
+    place: (3, s, b) x, y, z [mm]. motion: (3, s, b) displacement over the stamp [mm]. weight:
+    (s, b) how much a point touches, 1 at the tip. travel: (b,) that the tip's contact counts as
+    [mm]. volume: (s, b) [mm^3].
     step: () travel of the brush [mm].
     """
 
@@ -72,7 +73,8 @@ def corners(config: PaintConfig, place, shape):
       place: (3, n) x, y, z in cells; cell centres at whole numbers. shape: (z, y, x).
 
     Returns:
-      index (8, n) into the flat cells, clipped into the grid; share (8, n), 0 off the sides.
+      index (8, n) into the flat cells, clipped into the grid; share (8, n), 0 off the sides and
+      above; what is below the canvas counts as in the first layer.
     """
     z, y, x = shape
     low = jnp.floor(place)
@@ -86,7 +88,7 @@ def corners(config: PaintConfig, place, shape):
                 share = jnp.ones_like(part[0])
                 for d, p in ((dx, part[0]), (dy, part[1]), (dz, part[2])):
                     share = share * (p if d else 1.0 - p)
-                inside = (i >= 0) & (i < x) & (j >= 0) & (j < y)
+                inside = (i >= 0) & (i < x) & (j >= 0) & (j < y) & (k < z)
                 i, j = jnp.clip(i, 0, x - 1), jnp.clip(j, 0, y - 1)
                 k = jnp.clip(k, 0, z - 1)
                 index.append((k * y + j) * x + i)

@@ -30,24 +30,37 @@ def _near(field, cells: int):
     )
 
 
+def stored(tree, one):
+    """The same values, as arrays that XLA keeps instead of working them out again for each reader:
+    it never repeats a division. (The CPU back end drops `optimization_barrier`.)
+
+    Args:
+      one: () traced 1.0.
+    """
+    return jax.tree.map(lambda x: x / one, tree)
+
+
 def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, points, tooth):
     """One stamp on a window.
 
     Args:
-      paint: (k, z, y, x). points: Hair relative to the window. tooth: (y, x) [mm].
+      paint: (z, k, y, x). points: Hair relative to the window. tooth: (y, x) [mm].
 
     Returns:
       (paint, brush, residual (4,)).
     """
+    one = 1.0 + 0.0 * points.step
     paint, brush = transfer(config, params, paint, brush, points, tooth)
+    paint = stored(paint, one)
     brush = refill(config, params, brush, points.travel)
     z, _ = ride(config, params, paint, points)
-    phi, motion = splat(config, points, z, paint.shape[1:])
-    moved = flow(config, params, jnp.sum(paint, axis=0), phi, motion, points.step)
-    paint = advect(config, paint, moved.face)
+    phi, motion = stored(splat(config, points, z, (paint.shape[0], *paint.shape[2:])), one)
+    fill = stored(jnp.sum(paint, axis=1), one)
+    moved = flow(config, params, fill, phi, motion, points.step)
+    paint = stored(advect(config, paint, stored(moved.face, one)), one)
     paint = repack(paint, 1.0 - phi)
     hairy = (jnp.sum(phi, axis=0) > 0.0).astype(paint.dtype)
-    paint = slump(config, params, paint, _near(hairy, 2), points.step)
+    paint = stored(slump(config, params, paint, _near(hairy, 2), points.step), one)
     paint = repack(paint, 1.0 - phi)
     return paint, brush, moved.residual
 
@@ -61,7 +74,7 @@ def paint_stroke(
     bit-identical and costs nothing. Stamps should be at most a pixel apart.
 
     Args:
-      canvas: (k, z, y, x) pigment amounts. brush: paint of b bristles.
+      canvas: (z, k, y, x) pigment amounts. brush: paint of b bristles.
       track: BristleTrack of t stamps, with at least 2 nodes, on the same canvas coordinates [mm].
       tooth: (y, x) height of the weave [mm], or None for a smooth canvas.
 
@@ -71,10 +84,10 @@ def paint_stroke(
     Raises:
       ValueError: shapes that do not fit.
     """
-    k, layers, h, w = canvas.shape
+    layers, k, h, w = canvas.shape
     if (k, layers) != (config.pigments, config.layers) or min(h, w) < config.window:
         raise ValueError(
-            f"canvas has shape {canvas.shape}: expected ({config.pigments}, {config.layers}, y, x) "
+            f"canvas has shape {canvas.shape}: expected ({config.layers}, {config.pigments}, y, x) "
             f"with y, x >= config.window = {config.window}"
         )
     b = track.position.shape[-1]
@@ -105,7 +118,7 @@ def paint_stroke(
         local = lambda n: jnp.swapaxes(n - offset[:, None, None], 0, 1)  # noqa: E731
         active = jnp.where(valid, jnp.ones(b.shape[-1], canvas.dtype), 0.0)
         points = hair(config, params, local(a), local(b), dt, active)
-        window = jax.lax.dynamic_slice(canvas, (0, 0, y, x), (k, layers, size, size))
+        window = jax.lax.dynamic_slice(canvas, (0, 0, y, x), (layers, k, size, size))
         cloth = jax.lax.dynamic_slice(tooth, (y, x), (size, size))
         painted, wet, residual = stamp(config, params, window, brush, points, cloth)
         painted = jnp.where(valid, painted, window)
@@ -115,7 +128,7 @@ def paint_stroke(
         tip = local(b)[1]
         out = (tip[0] < 0.0) | (tip[0] > side) | (tip[1] < 0.0) | (tip[1] > side)
         low = tip[2] < config.layer * layers
-        fullest = jnp.max(jnp.sum(painted[:, :-1], axis=0))
+        fullest = jnp.max(jnp.sum(painted[:-1], axis=1))
         return (canvas, wet), (residual, fullest, ~jnp.any(out & low) | ~valid)
 
     (canvas, brush), seen = jax.lax.scan(

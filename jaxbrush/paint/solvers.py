@@ -17,7 +17,8 @@ TINY = 1e-20
 @state
 class Matrix:
     """diagonal, and x, y, z: minus the coupling to the next cell along each axis (>= 0; the last
-    is 0). All (..., z, y, x); positive definite."""
+    is 0). All (z, ..., y, x), z first so that lines along z are scanned without a transpose;
+    positive definite."""
 
     diagonal: jax.Array
     x: jax.Array
@@ -43,15 +44,14 @@ def apply(matrix: Matrix, a):
     """The matrix times a."""
     n = a.ndim
     out = matrix.diagonal * a
-    for axis, c in ((n - 1, matrix.x), (n - 2, matrix.y), (n - 3, matrix.z)):
+    for axis, c in ((n - 1, matrix.x), (n - 2, matrix.y), (0, matrix.z)):
         out = out - c * _next(a, axis) - _last(c * a, axis)
     return out
 
 
 def _line_factors(matrix: Matrix):
     """Forward elimination along z, z first: (1 / pivot, coupling / pivot)."""
-    diagonal = jnp.moveaxis(matrix.diagonal, -3, 0)
-    coupling = jnp.moveaxis(matrix.z, -3, 0)
+    diagonal, coupling = matrix.diagonal, matrix.z
 
     def down(carry, inputs):
         before, ratio = carry
@@ -66,9 +66,8 @@ def _line_factors(matrix: Matrix):
 
 
 def line_solve(factors, rhs):
-    """Solves the part of the matrix along z, (..., z, y, x)."""
+    """Solves the part of the matrix along z, (z, ..., y, x)."""
     coupling, inverse, ratio = factors
-    rhs = jnp.moveaxis(rhs, -3, 0)
 
     def down(carry, inputs):
         value, before = carry
@@ -84,11 +83,11 @@ def line_solve(factors, rhs):
     zero = jnp.zeros_like(rhs[0])
     _, y = jax.lax.scan(down, (zero, zero), (rhs, inverse, coupling))
     _, x = jax.lax.scan(up, zero, (y, ratio), reverse=True)
-    return jnp.moveaxis(x, 0, -3)
+    return x
 
 
 def _dot(a, b):
-    return jnp.sum(a * b, axis=(-3, -2, -1), keepdims=True)
+    return jnp.sum(a * b, axis=(0, a.ndim - 2, a.ndim - 1), keepdims=True)
 
 
 def pcg(matrix: Matrix, rhs, iterations: int, line: bool = True):
@@ -122,7 +121,7 @@ def pcg(matrix: Matrix, rhs, iterations: int, line: bool = True):
 
 def _relative(residual, rhs):
     size = jnp.sqrt(_dot(rhs, rhs))
-    return (jnp.sqrt(_dot(residual, residual)) / jnp.maximum(size, TINY))[..., 0, 0, 0]
+    return (jnp.sqrt(_dot(residual, residual)) / jnp.maximum(size, TINY))[0, ..., 0, 0]
 
 
 def chebyshev(matrix: Matrix, rhs, iterations: int, least: float = 0.05):

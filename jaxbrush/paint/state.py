@@ -122,7 +122,7 @@ class BrushPaint:
 
 
 def empty_canvas(config: PaintConfig, shape) -> jax.Array:
-    """Bare canvas (k, z, y, x): share of each cell that each pigment fills, of `shape` (h, w).
+    """Bare canvas (z, k, y, x): share of each cell that each pigment fills, of `shape` (h, w).
 
     Raises:
       ValueError: a canvas smaller than the window.
@@ -130,7 +130,7 @@ def empty_canvas(config: PaintConfig, shape) -> jax.Array:
     h, w = shape
     if min(h, w) < config.window:
         raise ValueError(f"shape = {(h, w)}: expected at least the window, {config.window} cells")
-    return jnp.zeros((config.pigments, config.layers, h, w), float)
+    return jnp.zeros((config.layers, config.pigments, h, w), float)
 
 
 def load_brush(config: PaintConfig, params: PaintParams, bristles: int, load, mix) -> BrushPaint:
@@ -151,7 +151,7 @@ def load_brush(config: PaintConfig, params: PaintParams, bristles: int, load, mi
 
 def volume(config: PaintConfig, canvas) -> jax.Array:
     """(k,) volume of each pigment on a canvas [mm^3]."""
-    return config.cell * jnp.sum(canvas, axis=(1, 2, 3))
+    return config.cell * jnp.sum(canvas, axis=(0, 2, 3))
 
 
 def height(config: PaintConfig, canvas) -> jax.Array:

@@ -38,14 +38,14 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     """Moves paint between brush and window in one stamp.
 
     Args:
-      paint: (k, z, y, x) window. brush: paint of b bristles. hair: points, relative to the window.
+      paint: (z, k, y, x) window. brush: paint of b bristles. hair: points, relative to the window.
       tooth: (y, x) height of the canvas's weave [mm].
 
     Returns:
       (paint, brush).
     """
     pigments, bristles = brush.tip.shape
-    shape = paint.shape[1:]
+    shape = (paint.shape[0], *paint.shape[2:])
     points = hair.weight.shape[0]
     capacity = params.tip_volume / bristles
     area = params.contact_area / (bristles * points)
@@ -81,16 +81,19 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
         ]
     ).reshape(3, -1)
     index, share = corners(config, place, shape)
-    flat = paint.reshape(pigments, -1)
-    fill = jnp.sum(flat, axis=0)
+    fill = jnp.sum(paint, axis=1).reshape(-1)
     asked = (lift + swap).reshape(-1)[None] * share / config.cell
     total = jnp.zeros_like(fill).at[index].add(asked)
     granted = jnp.minimum(1.0, 0.9 * fill / jnp.maximum(total, TINY))
     taken = asked * granted[index]
     lost = total * granted / jnp.maximum(fill, TINY)
-    # Share of each pigment in each cell, looked up for the 8 corners of each point.
-    color = flat / jnp.maximum(fill, TINY)[None]
-    gained = jnp.sum(taken[None] * color[:, index], axis=1) * config.cell
+    by = taken / jnp.maximum(fill, TINY)[index]
+    plane = shape[1] * shape[2]
+    level, column = index // plane, index % plane
+    # (k, 8, n): the same cells of each pigment, which lie a plane apart.
+    pigment = jnp.arange(pigments, dtype=jnp.int32)[:, None, None]
+    cells = (level[None] * pigments + pigment) * plane + column[None]
+    gained = jnp.sum(by[None] * paint.reshape(-1)[cells], axis=1) * config.cell
     gained = jnp.sum(gained.reshape(pigments, points, bristles), axis=1)
     amount = jnp.sum(taken, axis=0).reshape(points, bristles) * config.cell
     back = amount * swap / jnp.maximum(lift + swap, TINY * config.cell)
@@ -104,12 +107,10 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     added = (out / jnp.maximum(inside, TINY)).reshape(-1)[None] * share / config.cell
     given = mix[:, None] * out[None]
     tip = brush.tip - jnp.sum(given, axis=1) + gained
-    tip = jnp.maximum(tip, 0.0)
     by_point = jnp.broadcast_to(mix[:, None], (pigments, points, bristles)).reshape(pigments, 1, -1)
-    flat = flat * (1.0 - lost)[None]
-    cells = jnp.arange(pigments, dtype=jnp.int32)[:, None, None] * fill.shape[0] + index[None]
-    flat = flat.reshape(-1).at[cells].add(by_point * added[None]).reshape(paint.shape)
-    return flat, BrushPaint(tip=tip, reservoir=brush.reservoir)
+    paint = paint * (1.0 - lost).reshape(shape)[:, None]
+    paint = paint.reshape(-1).at[cells].add(by_point * added[None]).reshape(paint.shape)
+    return paint, BrushPaint(tip=tip, reservoir=brush.reservoir)
 
 
 def refill(config: PaintConfig, params: PaintParams, brush: BrushPaint, travel) -> BrushPaint:

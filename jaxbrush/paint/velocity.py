@@ -5,8 +5,8 @@ each stamp solves for the displacement of the paint, dragged by the hair (Brinkm
 canvas, free at its surface; then makes it incompressible. Viscosity cancels, for drag and
 viscous stress both grow with it.
 
-Displacements are in cells a stamp, on the faces between a cell and the next along x, y, z: (3, z,
-y, x), x first. The outermost faces do not move.
+Displacements are in cells a stamp, on the faces between a cell and the next along x, y, z: a list
+of three (z, y, x). The outermost faces do not move.
 """
 
 import jax
@@ -22,10 +22,10 @@ AXES = (-1, -2, -3)
 
 @state
 class Flow:
-    """face: (3, z, y, x) displacement [cells]. residual: (4,) of the three viscous solves and the
-    pressure, relative."""
+    """face: displacement along x, y, z, each (z, y, x) [cells]. residual: (4,) of the three
+    viscous solves and the pressure, relative."""
 
-    face: jax.Array
+    face: list
     residual: jax.Array
 
 
@@ -67,7 +67,7 @@ def _not_last(shape, axis, dtype):
 
 
 def viscous(config: PaintConfig, params: PaintParams, fill, phi, motion):
-    """Displacement of dragged, sticky paint, (3, z, y, x), and residuals (3,).
+    """Displacement of dragged, sticky paint, three (z, y, x), and residuals (3,).
 
     Solves (beta + L) u = beta u_hair for each component on its faces: beta = drag * phi * pixel^2;
     L the viscous 7-point operator, weighted by wetness (no stress at air), no slip on the canvas.
@@ -95,9 +95,10 @@ def viscous(config: PaintConfig, params: PaintParams, fill, phi, motion):
         # Dry faces do not move, and must not make the matrix singular.
         diagonal = diagonal + beta * hair + 1e-3
         parts.append((Matrix(diagonal, x, y, z), beta * pull))
-    matrix = jax.tree.map(lambda *a: jnp.stack(a), *[p[0] for p in parts])
-    rhs = jnp.stack([p[1] for p in parts])
-    return solve("zline_pcg", matrix, rhs, config.viscous)
+    matrix = jax.tree.map(lambda *a: jnp.stack(a, axis=1), *[p[0] for p in parts])
+    rhs = jnp.stack([p[1] for p in parts], axis=1)
+    face, residual = solve("zline_pcg", matrix, rhs, config.viscous)
+    return [face[:, k] for k in range(3)], residual
 
 
 def divergence(face):
@@ -113,7 +114,7 @@ def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     open only as far as there is no hair.
 
     Returns:
-      (face (3, z, y, x), relative residual ()).
+      (three faces (z, y, x), relative residual ()).
     """
     liquid = (fill + phi >= 0.5).astype(fill.dtype)
     source = params.source * jnp.maximum(fill + phi - 1.0, 0.0)
@@ -139,7 +140,7 @@ def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     moved = [
         face[k] - weights[k] * (_next(pressure, 3 + axis) - pressure) for k, axis in enumerate(AXES)
     ]
-    return jnp.stack(moved), residual
+    return moved, residual
 
 
 def stop(params: PaintParams, config: PaintConfig, face, step):
@@ -150,16 +151,15 @@ def stop(params: PaintParams, config: PaintConfig, face, step):
     Args:
       step: () travel of the brush in the stamp [mm].
     """
-    threshold = params.yield_share * step / config.pixel
+    # A brush at rest moves nothing either, and no rounding does.
+    threshold = jnp.maximum(params.yield_share * step / config.pixel, 1e-4)
     square = 0.0
     for k, axis in enumerate(AXES):
         scale = config.layer / config.pixel if k == 2 else 1.0
         middle = 0.5 * scale * (face[k] + _last(face[k], 3 + axis))
         square = square + middle * middle
     keep = jnp.clip(1.0 - threshold / jnp.sqrt(square + 1e-12), 0.0, 1.0)
-    return jnp.stack(
-        [face[k] * jnp.maximum(keep, _next(keep, 3 + axis)) for k, axis in enumerate(AXES)]
-    )
+    return [face[k] * jnp.maximum(keep, _next(keep, 3 + axis)) for k, axis in enumerate(AXES)]
 
 
 def flow(config: PaintConfig, params: PaintParams, fill, phi, motion, step) -> Flow:
