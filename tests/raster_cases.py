@@ -7,11 +7,18 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.raster import trajectory_maps
+from jaxbrush.raster import make_grid, trajectory_maps
 from jaxbrush.raster.sweeps import TIP_STIFFNESS
 
+PIXEL = 0.125
+"""Whole pixels, and positions of a 64th of one, are exact in float32."""
+WIDTH, SIDE, STAMPS, BRISTLES = 0.375, 48, 240, 6
 STATIC = ("width", "edge", "nodes", "longest")
 draw = jax.jit(trajectory_maps, static_argnames=STATIC)
+
+
+def canvas(origin=(0.0, 0.0), side=SIDE, pixel=PIXEL):
+    return make_grid((side, side), origin, pixel)
 
 
 def make_track(path, force=100.0, height=0.0, time=None, valid=None, nodes=1):
@@ -35,13 +42,13 @@ def make_track(path, force=100.0, height=0.0, time=None, valid=None, nodes=1):
     )
 
 
-def random_track(seed=0, stamps=24, bristles=6, size=5.0, step=0.35, air=0.4):
-    """Tips that wander inside size x size mm, rest, jump, lift off and come down again."""
+def random_track(seed=0, stamps=24, bristles=6, size=5.0, step=0.35, air=0.4, rest=0.15, leap=0.06):
+    """Tips that wander inside size x size mm, rest, leap, lift off and come down again."""
     rng = np.random.default_rng(seed)
     turn = np.cumsum(rng.normal(0.0, 0.8, (stamps, bristles)), axis=0)
     length = step * rng.uniform(0.0, 1.5, (stamps, bristles))
-    length[rng.random((stamps, bristles)) < 0.15] = 0.0
-    length[rng.random((stamps, bristles)) < 0.06] = 0.5 * size
+    length[rng.random((stamps, bristles)) < rest] = 0.0
+    length[rng.random((stamps, bristles)) < leap] = 0.5 * size
     way = np.stack([length * np.cos(turn), length * np.sin(turn)], axis=1)
     path = rng.uniform(0.0, size, (2, bristles)) + np.cumsum(way, axis=0)
     # Mirrored at the borders, so that long walks stay inside.
@@ -57,14 +64,31 @@ def colors(bristles, seed=7):
     return np.random.default_rng(seed).uniform(0.1, 1.0, (bristles, 3))
 
 
-def padded(track, extra):
-    """The track with `extra` invalid stamps, as far-off numbers that must not be looked at."""
+def padded(track, stamps=STAMPS, bristles=BRISTLES):
+    """The track with stamps that are not valid, and bristles that never touch, up to a size that
+    all tests share, so that it compiles once. The invalid stamps hold what must not be used."""
+    # By numpy: every new shape would compile several small functions.
     junk = {"time": 99.0, "position": 1.0, "force": 50.0, "reaction": 0.0, "valid": False}
+    t, m, _, b = track.position.shape
+    track = jax.tree.map(np.asarray, track)
+    away = np.broadcast_to(np.array([3.0, 3.0, 5.0])[:, None], (t, m, 3, bristles - b))
+    track = dataclasses.replace(
+        track,
+        position=np.concatenate([track.position, away.astype(track.position.dtype)], axis=-1),
+        force=np.pad(track.force, ((0, 0), (0, 0), (0, bristles - b))),
+    )
 
     def longer(name, x):
-        return jnp.concatenate([x, jnp.full((extra, *x.shape[1:]), junk[name], x.dtype)])
+        more = np.full((stamps - t, *x.shape[1:]), junk[name], x.dtype)
+        return jnp.asarray(np.concatenate([x, more]))
 
     return BristleTrack(**{name: longer(name, getattr(track, name)) for name in junk})
+
+
+def exact_maps(track, color=None, grid=None):
+    """Exact maps by the one compiled function that most tests share."""
+    color = colors(BRISTLES) if color is None else np.resize(color, (BRISTLES, 3))
+    return draw(canvas() if grid is None else grid, padded(track), color, width=WIDTH)
 
 
 def stack(tracks):
@@ -98,17 +122,18 @@ def assert_finite(tree):
 class Reference:
     """Exact maps by loops, and what the comparison needs to know.
 
-    exit: way from the start of its sweep to where the latest bristle left the pixel [pixels].
-    span: length of that sweep [pixels]. rim: whether that pixel is near the sweep's side, where
-    the time of leaving is cut off. tie: several bristles at the latest stamp. unsure: some sweep
-    ends so close to the pixel that rounding may decide.
+    bristle: that came last, -1 where none did. passes: how often one came. force [µN], when
+    [s]: at which it left; fall, pace: their changes a pixel of its way. rim: whether the pixel is
+    near the side of that sweep, where the way to its end is cut off. tie: several bristles at the
+    latest stamp. unsure: some sweep ends so close to the pixel that rounding may decide.
     """
 
-    key: np.ndarray
+    bristle: np.ndarray
     passes: np.ndarray
-    pressed: np.ndarray
-    exit: np.ndarray
-    span: np.ndarray
+    force: np.ndarray
+    when: np.ndarray
+    fall: np.ndarray
+    pace: np.ndarray
     rim: np.ndarray
     tie: np.ndarray
     unsure: np.ndarray
@@ -124,38 +149,46 @@ def reference(grid, track, width, tiny=2e-3) -> Reference:
     depth = np.where(force > 0, force / TIP_STIFFNESS, -np.maximum(np.abs(tip[:, 2]), 1e-6))
     stamps, bristles = force.shape
     radius = 0.5 * width / grid.pixel
-    out = Reference(*(np.zeros((h, w)) for _ in range(8)))
-    out.key, out.passes = np.zeros((h, w), int), np.zeros((h, w), int)
-    out.tie, out.rim = np.zeros((h, w), bool), np.zeros((h, w), bool)
-    out.unsure = np.zeros((h, w), bool)
-    before = np.zeros((bristles, h, w), bool)
+    time = np.asarray(track.time, float)
+    number, boolean = lambda: np.zeros((h, w)), lambda: np.zeros((h, w), bool)  # noqa: E731
+    out = Reference(
+        bristle=np.full((h, w), -1), passes=np.zeros((h, w), int), force=number(), when=number(),
+        fall=number(), pace=number(), rim=boolean(), tie=boolean(), unsure=boolean(),
+    )  # fmt: skip
+    stamp_of, before = np.full((h, w), -1), np.zeros((bristles, h, w), bool)
     for t in range(stamps):
         for b in range(bristles):
             s = max(t - 1, 0)
             d0, d1 = depth[s, b], depth[t, b]
-            covered = np.zeros((h, w), bool)
-            if max(d0, d1) > 0 and bool(track.valid[t]):
-                start, way = place[s, :, b], place[t, :, b] - place[s, :, b]
-                low = 0.0 if d0 > 0 or t == 0 else d0 / (d0 - d1)
-                high = 1.0 if d1 > 0 else d0 / (d0 - d1)
-                length = np.hypot(*way)
-                along = (way / length) if length > 0 else np.array([1.0, 0.0])
-                rx, ry = xs - start[0], ys - start[1]
-                # Along and across the sweep, as in its own frame.
-                u, v = rx * along[0] + ry * along[1], ry * along[0] - rx * along[1]
-                nearest = np.clip(u, low * length, high * length)
-                distance = np.hypot(u - nearest, v)
-                covered = distance <= radius
-                out.unsure |= np.abs(distance - radius) < tiny
-                leave = u + np.sqrt(np.maximum(radius**2 - v**2, 0.0))
-                leave = np.minimum(leave, high * length) if length > 0 else 0.0 * u
-                share = leave / length if length > 0 else 1.0 + 0.0 * u
-                load = force[s, b] + share * (force[t, b] - force[s, b])
-                out.tie[covered] = out.key[covered] > t * bristles
-                out.key[covered] = t * bristles + b + 1
-                out.pressed[covered], out.exit[covered] = load[covered], leave[covered]
-                out.span[covered] = length
-                out.rim[covered] = (v**2 > 0.89 * radius**2)[covered]
-                out.passes += covered & ~before[b]
+            if max(d0, d1) <= 0 or not bool(track.valid[t]):
+                before[b] = False
+                continue
+            start, way = place[s, :, b], place[t, :, b] - place[s, :, b]
+            low = 0.0 if d0 > 0 or t == 0 else d0 / (d0 - d1)
+            high = 1.0 if d1 > 0 else d0 / (d0 - d1)
+            length = np.hypot(*way)
+            along = way / length if length > 0 else np.array([1.0, 0.0])
+            rx, ry = xs - start[0], ys - start[1]
+            # Along and across the sweep, in its own frame.
+            u, v = rx * along[0] + ry * along[1], ry * along[0] - rx * along[1]
+            distance = np.hypot(u - np.clip(u, low * length, high * length), v)
+            covered = distance <= radius
+            out.unsure |= np.abs(distance - radius) < tiny
+            leave = np.minimum(u + np.sqrt(np.maximum(radius**2 - v**2, 0.0)), high * length)
+            share = leave / length if length > 0 else high + 0.0 * u
+            gain, span = force[t, b] - force[s, b], time[t] - time[s]
+            for name, value in (
+                ("tie", stamp_of == t),
+                ("bristle", b),
+                ("force", force[s, b] + share * gain),
+                ("when", time[s] + share * span),
+                ("fall", abs(gain) / length if length > 0 else 0.0),
+                ("pace", span / length if length > 0 else 0.0),
+                ("rim", v**2 > 0.89 * radius**2),
+            ):
+                field = getattr(out, name)
+                field[covered] = np.broadcast_to(value, (h, w))[covered]
+            stamp_of[covered] = t
+            out.passes += covered & ~before[b]
             before[b] = covered
     return out

@@ -75,6 +75,7 @@ def stroke_grid(track, width: float, pixel: float = PIXEL, margin: int = 4) -> G
     touch = touch.copy()
     touch[1:] |= touch[:-1]
     touch[:-1] |= touch[1:]
+    touch &= np.asarray(track.valid)[:, None, None]
     at = np.moveaxis(place, 2, -1)[touch]
     low = np.floor((at.min(0) - 0.5 * width) / pixel).astype(int) - margin
     high = np.ceil((at.max(0) + 0.5 * width) / pixel).astype(int) + margin

@@ -5,11 +5,14 @@ over each other in time order, and consecutive sweeps of one bristle count as on
 replaces what the same bristle left at the stamp before, so the result does not depend on how
 finely the stroke is sampled. With layers P (coverage, and values times coverage) that is
 
-  P <- keep P + add,  keep = (1 - a) / (1 - a_before + SLACK),  add = a v - keep a_before v_before
+  P <- keep P + add,  keep = (1 - a) / max(1 - min(a, a_before), SLACK),
+                      add = a v + (1 - keep - a) v_before
 
-(for a falling a, coverage stays and the value moves on). The backward pass runs the same sweeps
-in reverse from the windows that the forward pass replaced: its cost and memory grow with the
-number of windows, not with the size of the image times the number of stamps.
+(for a falling a, keep is 1: coverage stays and the value moves on). The weights in add sum to
+1 - keep, so what is bare, 1 - coverage, is multiplied by keep: coverage never falls. The
+backward pass runs the same sweeps in reverse from the windows that the forward pass replaced: its
+cost and memory grow with the number of windows, not with the size of the image times the number
+of stamps.
 """
 
 import dataclasses
@@ -22,7 +25,7 @@ from jaxbrush.raster.sweeps import FAR, Sweeps, before, exit_share, nearest
 from jaxbrush.structs import state
 
 SLACK = 1e-2
-"""Keeps the share that a bristle leaves of its own earlier touch finite."""
+"""Bare share below which a touch counts as full: it then replaces what lies there."""
 
 
 @state
@@ -56,19 +59,18 @@ def _windows(sweeps, earlier, y, x, side, radius, edge, height):
     py, px = y + index[None, :, None], x + index[None, None, :]
     a = _coverage(sweeps, px, py, radius, edge, height)
     old = _coverage(earlier, px, py, radius, edge, height)
-    most = jnp.maximum(a, old)
     there = a > 0.0
     # Nothing changes where the bristle is gone.
-    keep = jnp.where(there, (1.0 - most) / (1.0 - old + SLACK), 1.0)
+    keep = jnp.where(there, (1.0 - a) / jnp.maximum(1.0 - jnp.minimum(a, old), SLACK), 1.0)
     # Of the layer: by this sweep, and taken back from the one before.
-    now, then = jnp.where(there, a, 0.0), jnp.where(there, most - a - keep * old, 0.0)
+    now, then = jnp.where(there, a, 0.0), jnp.where(there, 1.0 - keep - a, 0.0)
     share = exit_share(sweeps, px, py, radius)
     back = exit_share(earlier, px, py, radius)
     force = now * (sweeps.press + share * sweeps.gain)
     force = force + then * (earlier.press + back * earlier.gain)
     time = now * (sweeps.time + share * sweeps.span)
     time = time + then * (earlier.time + back * earlier.span)
-    return keep, jnp.stack([now + then, force, time], axis=1), jnp.where(there, most - old, 0.0)
+    return keep, jnp.stack([now + then, force, time], axis=1), jnp.maximum(a - old, 0.0)
 
 
 @jax.custom_vjp

@@ -70,8 +70,9 @@ def sweeps_of(grid, track, nodes: int, threshold: float) -> Sweeps:
         raise ValueError(f"nodes = {nodes}: expected between 1 and the {have} of the track")
     stamps = track.position.shape[0]
     flat = lambda x: x[:, -nodes:].reshape(stamps, -1)  # noqa: E731
-    x = (flat(track.position[:, :, 0]) - grid.origin[0]) / grid.pixel - 0.5
-    y = (flat(track.position[:, :, 1]) - grid.origin[1]) / grid.pixel - 0.5
+    origin = grid.origin.astype(track.position.dtype)
+    x = (flat(track.position[:, :, 0]) - origin[0]) / grid.pixel - 0.5
+    y = (flat(track.position[:, :, 1]) - origin[1]) / grid.pixel - 0.5
     force = flat(track.force)
     pressed = (force > 0.0) & track.valid[:, None]
     force = jnp.where(pressed, force, 0.0)
