@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import tyro
-from matplotlib.colors import LinearSegmentedColormap
+from matplotlib.colors import LinearSegmentedColormap, to_rgb
 from PIL import Image
 from rich.progress import track as progress
 
@@ -30,12 +30,15 @@ from experiments.common import (
 )
 from jaxbrush.brush import BrushConfig, make_brush, rollout
 from jaxbrush.raster import PIXEL, WIDTH, make_grid, stroke_grid, trajectory_maps
+from jaxbrush.raster.sweeps import TIP_STIFFNESS
 from jaxbrush.stylus import make_stroke, pad
 
 STROKES = ("light", "heavy", "crossing", "fast", "dab", "turning", "scribble", "hook")
 COLUMNS = ("pressure", "sweeps", "color", "time", "coverage")
 SIDE = 256
 """Pixels along a side of the window of every stroke."""
+STEPS = (0.25, 0.5, 1.0, 2.0)
+"""Steps that soft maps are made for [mm]; a stroke takes the least that it fits in."""
 PAPER = (0.984, 0.974, 0.950)
 BLUE, YELLOW = (0.015, 0.085, 0.36), (0.86, 0.50, 0.02)
 """What the two halves of the brush are loaded with, linear RGB."""
@@ -144,15 +147,54 @@ def square_grid(track, width: float, side: int = SIDE, pixel: float = PIXEL):
     return make_grid((side, side), np.asarray(close.origin) - shift, pixel)
 
 
+def finer(grid, factor):
+    """The same window in pixels `factor` times smaller."""
+    shape = tuple(round(n * factor) for n in grid.shape)
+    return make_grid(shape, grid.origin, grid.pixel / factor)
+
+
+roll = jax.jit(rollout)
+
+
+@functools.partial(jax.jit, static_argnames=("width", "edge", "longest"))
+def draw(grid, track, color=(1.0, 1.0, 1.0), width=WIDTH, edge=None, longest=STEPS[-1]):
+    """Maps of a track."""
+    return trajectory_maps(grid, track, color, width=width, edge=edge, longest=longest)
+
+
+def between(track, times: int):
+    """The track with `times` stamps for each, linear in place and in how deep a tip is pressed."""
+    stamps = track.time.shape[0]
+    fine = np.arange((stamps - 1) * times + 1) / times
+    k = np.minimum(fine.astype(int), stamps - 2)
+
+    def fill(x):
+        x = np.asarray(x, np.float64)
+        share = (fine - k).reshape(-1, *(1,) * (x.ndim - 1))
+        return (1.0 - share) * x[k] + share * x[k + 1]
+
+    force, place = np.asarray(track.force), np.asarray(track.position)
+    deep = fill(np.where(force > 0.0, force / TIP_STIFFNESS, -np.abs(place[:, :, 2])))
+    place = fill(place)
+    place[:, :, 2] = np.maximum(-deep, 0.0)
+    found = {"time": fill(track.time), "position": place, "reaction": fill(track.reaction),
+             "force": np.maximum(deep, 0.0) * TIP_STIFFNESS}  # fmt: skip
+    found = {name: jnp.asarray(x.astype(np.float32)) for name, x in found.items()}
+    return dataclasses.replace(track, **found, valid=jnp.asarray(fill(track.valid) > 0.999))
+
+
+def longest_of(track) -> float:
+    """The least of STEPS that the steps of a track's tips fit in."""
+    step = np.abs(np.diff(np.asarray(track.position[:, -1, :2]), axis=0)).max(1)
+    contact = np.asarray(track.contact[:, -1])
+    step = step[contact[1:] | contact[:-1]].max(initial=0.0)
+    return next((x for x in STEPS if step <= x), STEPS[-1])
+
+
 def colors_of(params):
     """(b, 3) linear RGB: one half of the ferrule blue, the other yellow."""
     left = params.root[:1].T < 0.0
     return jnp.where(left, jnp.asarray([BLUE]), jnp.asarray([YELLOW])).astype(params.root.dtype)
-
-
-@functools.partial(jax.jit, static_argnames=("edge",))
-def _draw(grid, track, color, edge):
-    return trajectory_maps(grid, track, color, edge=edge, longest=1.0)
 
 
 def _part(name: str, low: float, high: float):
@@ -281,15 +323,10 @@ def sheet(drawn: dict, zoom: int, path: Path):
             page.image(left + c * (wide + gap), y, _enlarged(cell, zoom))
         y += tall + gap
     x = left + (len(COLUMNS) - 1) * (wide + gap)
-    bar = np.broadcast_to(np.array(matplotlib_rgb(INK)), (max(zoom // 2, 1), 50 * zoom, 3))
+    bar = np.broadcast_to(to_rgb(INK), (max(zoom // 2, 1), 50 * zoom, 3))
     page.image(x, height - 2 * bottom // 3, bar)
     page.text(x + 54 * zoom, height - 2 * bottom // 3, "5 mm", 12.0)
     page.save(path, 256)
-
-
-def matplotlib_rgb(color):
-    """(3,) of a named or hexadecimal color."""
-    return plt.matplotlib.colors.to_rgb(color)
 
 
 def comparison(light, heavy, zoom: int, path: Path) -> dict:
@@ -334,12 +371,11 @@ def gaps(coverage) -> dict:
     pixels away are touched), and touched pixels without a touched neighbour."""
     cover = np.pad(np.asarray(coverage) > 0.0, 2)
     inner = cover[2:-2, 2:-2]
-    around = (
-        lambda step: [  # noqa: E731
-            cover[2 + dy : cover.shape[0] - 2 + dy, 2 + dx : cover.shape[1] - 2 + dx]
-            for dy, dx in ((step, 0), (-step, 0), (0, step), (0, -step))
-        ]
-    )
+
+    def around(step):
+        shifts = ((step, 0), (-step, 0), (0, step), (0, -step))
+        return [np.roll(cover, shift, (0, 1))[2:-2, 2:-2] for shift in shifts]
+
     hole = ~inner & np.logical_and.reduce(around(2))
     lone = inner & ~np.logical_or.reduce(around(1))
     return {"touched": int(inner.sum()), "holes": int(hole.sum()), "lone": int(lone.sum())}
@@ -353,14 +389,14 @@ def main(options: Config) -> None:
     folder = results_folder("show_maps", options.out)
     config = BrushConfig()
     params = make_brush(jax.random.key(options.seed), config, "flat", options.bristles)
-    color, roll = colors_of(params), jax.jit(rollout)
+    color = colors_of(params)
     drawn, found = {}, {}
     # The comparison needs these two, whatever is on the sheet.
     needed = dict.fromkeys((*names, "light", "heavy"))
     for name in progress(list(needed), description="strokes", console=console, transient=True):
         track = roll(config, params, stroke_of(name, options.stamps))
         grid = square_grid(track, WIDTH)
-        drawn[name], timing = timed(_draw, grid, track, color, options.edge, repeats=1)
+        drawn[name], timing = timed(draw, grid, track, color, WIDTH, options.edge, repeats=5)
         found[name] = {"time": timing, **gaps(drawn[name].coverage)}
         for kind in ("pressure", "sweeps"):
             value = np.asarray(getattr(drawn[name], kind))
