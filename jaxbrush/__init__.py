@@ -19,6 +19,11 @@ from jaxbrush.brush import Surface as Surface  # noqa: E402
 from jaxbrush.brush import make_brush as make_brush  # noqa: E402
 from jaxbrush.brush import rollout as rollout  # noqa: E402
 from jaxbrush.brush import stable_dt as stable_dt  # noqa: E402
+from jaxbrush.raster import Grid as Grid  # noqa: E402
+from jaxbrush.raster import TrajectoryMaps as TrajectoryMaps  # noqa: E402
+from jaxbrush.raster import make_grid as make_grid  # noqa: E402
+from jaxbrush.raster import stroke_grid as stroke_grid  # noqa: E402
+from jaxbrush.raster import trajectory_maps as trajectory_maps  # noqa: E402
 from jaxbrush.stylus import Stroke as Stroke  # noqa: E402
 from jaxbrush.stylus import make_stroke as make_stroke  # noqa: E402
 from jaxbrush.stylus import random_stroke as random_stroke  # noqa: E402
