@@ -36,6 +36,9 @@ FORMAT = "jaxbrush-session"
 VERSION = 1
 
 _REQUIRED = ("t", "x", "y", "pressure")
+LOWEST_ALTITUDE = 0.35
+"""Pens are read as held no flatter than 20 degrees [rad]: some report 1, where a brush would lie on
+the canvas with its belly, which the nodes near the tip cannot show."""
 _OPTIONAL = ("altitude", "azimuth", "twist")
 _RANGES = {"pressure": (0.0, 1.0), "altitude": (0.0, math.pi / 2)}
 
@@ -139,7 +142,8 @@ def to_stroke(session: Session, event: StrokeEvent) -> Stroke:
 
     Args:
       session: gives the scale.
-      event: the samples; a pen without tilt is held perpendicular.
+      event: the samples; a pen without tilt is held perpendicular, one held flatter than
+        `LOWEST_ALTITUDE` at that.
     Returns:
       The stroke, every sample valid.
     """
@@ -149,7 +153,9 @@ def to_stroke(session: Session, event: StrokeEvent) -> Stroke:
         position=[(x * scale, y * scale) for x, y in zip(event.x, event.y, strict=True)],
         time=[t - start for t in event.t],
         pressure=event.pressure,
-        altitude=math.pi / 2 if event.altitude is None else event.altitude,
+        altitude=math.pi / 2
+        if event.altitude is None
+        else [max(a, LOWEST_ALTITUDE) for a in event.altitude],
         azimuth=0.0 if event.azimuth is None else event.azimuth,
         twist=0.0 if event.twist is None else event.twist,
     )

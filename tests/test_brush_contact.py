@@ -244,9 +244,7 @@ def test_relief_is_felt(key, integrator):
     # A perpendicular brush first buckles to one side: 0.6 mm for 40 stamps by the fast methods.
     error = np.abs(tip[:, 2] - want)[60:][touching[60:]].max()
     force = np.asarray(track.force).sum((1, 2))
-    print(
-        f"{integrator}: off the relief by up to {error:.4f} mm, force {force[100]}, {force[-1]}"
-    )
+    print(f"{integrator}: off the relief by up to {error:.4f} mm, force {force[100]}, {force[-1]}")
     assert touching.mean() > 0.5
     assert error < 0.05
     assert force[-1] > 1.02 * force[100]

@@ -9,9 +9,6 @@ from jaxbrush.stylus import Stroke
 
 APPROACH_DT = 1e-3
 """Time of one lowering step before the first stamp, and of a padded stamp [s]."""
-LOWEST_ALTITUDE = 0.35
-"""A handle held flatter than 20 degrees is taken to be at 20 [rad]: pens report such tilts, but a
-brush there would lie on the canvas with its belly, which the nodes near the tip cannot show."""
 SMALLEST_DT = 1e-5
 """Repeated device times are read as this far apart [s]."""
 
@@ -83,8 +80,7 @@ def poses(params: BrushParams, stroke: Stroke, approach: int, press: bool = True
     dtype = params.length.dtype
     first = jnp.zeros(approach, int)
     index = jnp.concatenate([first, jnp.arange(stroke.time.shape[0])])
-    altitude = jnp.maximum(stroke.altitude, LOWEST_ALTITUDE)
-    rotation = jax.vmap(frame)(altitude, stroke.azimuth, stroke.twist)
+    rotation = jax.vmap(frame)(stroke.altitude, stroke.azimuth, stroke.twist)
     reach = _reach(params, rotation)[index]
     rotation = rotation[index]
     ramp = jnp.concatenate(

@@ -77,11 +77,11 @@ def _nearest(sweep: Sweeps, y, x, side):
 def _paint_loop(image, offers, corner, live, side, combine):
     """One window after the other, only those that are `live`: the fastest way on a CPU."""
 
-    def collect(i, carry):
+    def collect(number, carry):
         order, count = carry
-        at = jnp.full((1,), i, jnp.int32)
-        order = jax.lax.dynamic_update_slice(order, at, (count,))
-        return order, count + live[i].astype(jnp.int32)
+        entry = jnp.full((1,), number, jnp.int32)
+        order = jax.lax.dynamic_update_slice(order, entry, (count,))
+        return order, count + live[number].astype(jnp.int32)
 
     # One scalar loop: 4 times faster here than jnp.nonzero.
     start = (jnp.zeros(live.shape, jnp.int32), jnp.zeros((), jnp.int32))
