@@ -7,7 +7,6 @@ import numpy as np
 from jaxbrush.structs import config, state
 
 SOLVERS = ("zline_pcg", "jacobi_pcg", "chebyshev", "fixed_point")
-REPRESENTATIONS = ("layers", "heightfield")
 
 
 @config
@@ -18,8 +17,7 @@ class PaintConfig:
     window: cells along a side of the region that is simulated, around the brush. pigments: how
     many are mixed. samples: points on each bristle's lowest part. sweeps: points of each along its
     way from stamp to stamp. viscous, pressure: iterations. solver: of the pressure, one of
-    `SOLVERS`. limiter: second-order lateral fluxes. representation: "layers" (3D) or
-    "heightfield" (one mixed layer).
+    `SOLVERS`. limiter: second-order lateral fluxes.
     """
 
     pixel: float = 0.125
@@ -33,7 +31,6 @@ class PaintConfig:
     pressure: int = 10
     solver: str = "zline_pcg"
     limiter: bool = True
-    representation: str = "layers"
 
     def __post_init__(self):
         for name, least in (
@@ -46,11 +43,8 @@ class PaintConfig:
         for name in ("pixel", "layer"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"PaintConfig.{name} = {getattr(self, name)!r}: expected > 0 mm")
-        for name, options in (("solver", SOLVERS), ("representation", REPRESENTATIONS)):
-            if getattr(self, name) not in options:
-                raise ValueError(
-                    f"PaintConfig.{name} = {getattr(self, name)!r}: expected one of {options}"
-                )
+        if self.solver not in SOLVERS:
+            raise ValueError(f"PaintConfig.solver = {self.solver!r}: expected one of {SOLVERS}")
 
     @property
     def ratio(self) -> float:
