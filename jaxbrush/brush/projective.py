@@ -26,8 +26,8 @@ from jaxbrush.structs import state
 
 LARGEST_LOWERING = 0.5
 """[mm] the handle may move up or down in an iteration when the force is given."""
-TINY = 1e-20
-"""[mm^2] keeps the gradient of a segment's direction finite when it has no length."""
+TINY = 1e-12
+"""[mm^2] A segment below this has no direction: it is left as it is, with a finite gradient."""
 
 
 @state
@@ -312,7 +312,10 @@ def step(
         turn = _each(inverse, residual + inside[None] * push)
         lift = d[0] * turn[0] + d[1] * turn[1]
         e = e + jnp.concatenate([turn - d[:2] * (fold * lift)[None], lift[None]])
-        e = e * (length[None] / jnp.sqrt(_inner(e, e) + TINY))[None]
+        square = _inner(e, e)
+        alive = square > TINY
+        longer = jnp.where(alive, length[None], 1.0) / jnp.sqrt(jnp.where(alive, square, 1.0))
+        e = e * longer[None]
 
     seen = places(e, depth, config.tracked_nodes)
     node, velocity = (), ()
