@@ -178,7 +178,8 @@ def test_bristles_snap_back_after_lift(key, integrator):
     away = np.linalg.norm(away, axis=1).max(1)
     print(f"{integrator}: farthest from rest, pressed {away[59]:.3f}, then {away[60:66]} mm")
     assert away[59] > 1.0
-    # Inertia and damping of the dynamic ones take about 1 / 600 s each way.
+    # Every second stamp is solved when quasi-static: within 0.1 mm three stamps after the last
+    # pressed one. Inertia and damping of the dynamic ones take about 1 / 600 s each way.
     assert np.all(away[63 if integrator == "quasi_static" else 66 :] < 0.1)
     assert np.all(np.asarray(track.force[66:]) == 0.0)
 

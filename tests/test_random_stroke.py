@@ -113,7 +113,7 @@ def test_a_key_gives_one_stroke_everywhere(crowd):
     keys = jax.random.split(jax.random.key(0), 256)
     alone = jax.jit(stylus.random_stroke)(keys[7])
     # The sum along the path rounds differently when batched: up to 0.14 um on JAX 0.12.
-    assert_close(jax.tree.map(lambda x: x[7], crowd), alone, atol=5e-4)
+    assert_close(jax.tree.map(lambda x: x[7], crowd), alone, atol=2e-4)
     assert np.abs(crowd.position[7] - crowd.position[8]).max() > 0.1
 
 
