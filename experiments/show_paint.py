@@ -31,14 +31,14 @@ from jaxbrush.paint import (
     weave,
 )
 from jaxbrush.render import picture, shade
-from jaxbrush.stylus import make_stroke, pad
+from jaxbrush.stylus import make_stroke, resample
 
 PALETTE = {
     "white": (0.92, 0.90, 0.84), "orange": (0.80, 0.16, 0.02), "green": (0.02, 0.25, 0.10),
     "black": (0.02, 0.02, 0.03),
 }  # fmt: skip
 """Pigments, linear RGB."""
-STAMPS, SPEED = 256, 60.0
+STAMPS, SPEED = 320, 60.0
 """Stamps a stroke is padded to; speed of the hand [mm/s]."""
 BRISTLES = 260
 SHAPE = (160, 288)
@@ -66,8 +66,9 @@ class Config:
     """Enlargement of the picture."""
 
 
-def hand(corners, pressure: float, pixel: float):
-    """A stroke through rounded corners, stamps a pixel apart, pressed and lifted at its ends."""
+def hand(corners, pressure: float, pixel: float, depth: float = 5.0):
+    """A stroke through rounded corners, stamps a pixel of the handle's way apart, pressed and
+    lifted at its ends."""
     corners = np.asarray(corners, float)
     u = np.linspace(0.0, 1.0, 400)
     at = np.linspace(0.0, 1.0, len(corners))
@@ -76,13 +77,11 @@ def hand(corners, pressure: float, pixel: float):
     path = np.pad(path, ((20, 20), (0, 0)), mode="edge")
     path = np.stack([np.convolve(path[:, k], soft, "valid") for k in (0, 1)], 1)
     way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    place = np.linspace(0.0, way[-1], min(int(way[-1] / pixel) + 2, STAMPS))
-    path = np.stack([np.interp(place, way, path[:, k]) for k in (0, 1)], 1)
-    share = place / way[-1]
+    share = way / way[-1]
     press = pressure * np.clip(np.minimum(share / 0.12, (1.0 - share) / 0.15), 0.0, 1.0)
     heading = np.arctan2(*(path[-1] - path[0])[::-1])
-    stroke = make_stroke(path, place / SPEED, press, altitude=np.radians(50.0), azimuth=heading)
-    return pad(stroke, STAMPS)
+    stroke = make_stroke(path, way / SPEED, press, altitude=np.radians(50.0), azimuth=heading)
+    return resample(stroke, STAMPS, pixel, np.inf, depth)
 
 
 def main(options: Config) -> None:

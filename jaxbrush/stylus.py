@@ -133,20 +133,21 @@ def pad(stroke: Stroke, count: int) -> Stroke:
     return dataclasses.replace(jax.tree.map(longer, stroke), valid=valid)
 
 
-def stamps_needed(stroke: Stroke, spacing, max_dt) -> jax.Array:
+def stamps_needed(stroke: Stroke, spacing, max_dt, depth=0.0) -> jax.Array:
     """Counts the stamps that `resample` needs to keep the spacing asked for.
 
     Args:
       stroke: t samples.
       spacing: largest arc length between stamps [mm], > 0.
       max_dt: longest time between stamps [s], > 0.
+      depth: as for `resample`.
     Returns:
       () int32; 0 for a stroke without a valid sample.
     """
-    return _stamps(stroke, _progress(stroke, spacing, max_dt))
+    return _stamps(stroke, _progress(stroke, spacing, max_dt, depth))
 
 
-def resample(stroke: Stroke, count: int, spacing, max_dt) -> Stroke:
+def resample(stroke: Stroke, count: int, spacing, max_dt, depth=0.0) -> Stroke:
     """Places stamps at equal arc length, or at equal time where the hand is slow.
 
     The stroke is measured in stamp units, u = sum over segments of max(ds / spacing, dt / max_dt).
@@ -159,6 +160,8 @@ def resample(stroke: Stroke, count: int, spacing, max_dt) -> Stroke:
         `count`, spread evenly in u: coarser than asked, never cut short.
       spacing: arc length between stamps [mm], > 0.
       max_dt: longest time between stamps [s], > 0; may be infinite.
+      depth: way of the handle up or down for a change of pressure by 1 [mm], part of the arc
+        length: a brush that lifts steeply moves its tips, too.
     Returns:
       The stamps, `count` samples, `valid` where used. Everything is interpolated linearly, angles
       the short way round, so azimuth and twist may leave [-pi, pi].
@@ -167,7 +170,7 @@ def resample(stroke: Stroke, count: int, spacing, max_dt) -> Stroke:
     """
     if count < 2:
         raise ValueError(f"count is {count}, expected at least 2 stamps")
-    u = _progress(stroke, spacing, max_dt)
+    u = _progress(stroke, spacing, max_dt, depth)
     stamps = _stamps(stroke, u)
     last = jnp.clip(stamps - 1, 0, count - 1)
     step = jnp.maximum(1.0, u[-1] / (count - 1))
@@ -371,13 +374,14 @@ def _unwrap(angle):
     return angle - 2 * jnp.pi * jnp.concatenate([jnp.zeros_like(angle[:1]), jnp.cumsum(turns)])
 
 
-def _progress(stroke, spacing, max_dt):
+def _progress(stroke, spacing, max_dt, depth):
     """Measures the way from the start to each sample in stamp units, (t,)."""
     dtype = stroke.position.dtype
     for name, value in (("spacing", spacing), ("max_dt", max_dt)):
         if not isinstance(value, jax.core.Tracer) and not np.all(np.asarray(value) > 0):
             raise ValueError(f"{name} is {value}, expected a number above 0")
     square = jnp.sum(jnp.diff(stroke.position, axis=0) ** 2, axis=-1)
+    square = square + (depth * jnp.diff(stroke.pressure)) ** 2
     moved = square > 0
     way = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
     both = stroke.valid[1:] & stroke.valid[:-1]

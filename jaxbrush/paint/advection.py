@@ -1,68 +1,73 @@
-"""Conservative motion of pigment amounts: limited fluxes, columns repacked, steep steps slumped."""
+"""Conservative motion of pigment amounts: limited fluxes, columns repacked, steep steps slumped.
+
+Paint is flat planes (z, k, n), n = y * x.
+"""
 
 import jax
 import jax.numpy as jnp
 
-from jaxbrush.paint.solvers import _last, _next
 from jaxbrush.paint.state import PaintConfig, PaintParams
-from jaxbrush.paint.velocity import AXES
+from jaxbrush.paint.stencil import inner_x, inner_y, near, wide
 
 TINY = 1e-9
 SLOP = 1e-5
 """Excess or lack of a cell that is left alone, share of a cell."""
 
 
-def _limited(fill, q, n):
-    """Van Leer value of `fill` on the faces along axis n, for displacement q [cells]."""
-    forward = _next(fill, n) - fill
-    backward = fill - _last(fill, n)
+def _slope(fill, width, shift):
+    """Van Leer slope of wide fill along one axis, (z, n)."""
+    here = near(fill, width)
+    forward = near(fill, width, shift) - here
+    backward = here - near(fill, width, -shift)
     smooth = forward * backward > 0.0
-    # Ends in a division, which XLA stores instead of working it out again for each reader.
     slope = jnp.where(smooth, 2.0 * forward * backward, 0.0)
-    slope = slope / jnp.where(smooth, forward + backward, 1.0)
-    left = fill + 0.5 * (1.0 - q) * slope
-    right = _next(fill - 0.5 * (1.0 + q) * slope, n)
-    return jnp.where(q > 0.0, left, right)
+    return slope / jnp.where(smooth, forward + backward, 1.0)
 
 
 def advect(config: PaintConfig, paint, face):
-    """Moves pigments (z, k, y, x) by face displacements [cells], all below one cell.
+    """Moves pigments (z, k, n) by wide face displacements [cells], all below one cell.
 
     One scalar flux of paint a face carries the pigments in the shares of the cell it leaves, and
     no cell gives more than it has: amounts stay positive, colors in the hull of what was there.
     """
-    fill = jnp.sum(paint, axis=1)
-    right, left, out = [], [], 0.0
-    for k, axis in enumerate(AXES):
-        n = 3 + axis
-        q = jnp.clip(face[k], -1.0, 1.0)
-        if config.limiter and k < 2:
-            value = _limited(fill, q, n)
-        else:
-            value = jnp.where(q > 0.0, fill, _next(fill, n))
-        flux = q * value
-        right.append(jnp.maximum(flux, 0.0))
-        left.append(_last(jnp.maximum(-flux, 0.0), n))
-        out = out + right[k] + left[k]
+    width = config.window
+    fill = wide(jnp.sum(paint, axis=1), width)
+    here = near(fill, width)
+    steps = ((1, 0), (width, 0), (0, 1))
+    fluxes, out = [], 0.0
+    for (shift, layer), f in zip(steps, face, strict=True):
+        q = jnp.clip(near(f, width), -1.0, 1.0)
+        left, right = here, near(fill, width, shift, layer)
+        if config.limiter and not layer:
+            slope = wide(_slope(fill, width, shift), width)
+            left = left + 0.5 * (1.0 - q) * near(slope, width)
+            right = right - 0.5 * (1.0 + q) * near(slope, width, shift)
+        fluxes.append(wide(q * jnp.where(q > 0.0, left, right), width))
+    for (shift, layer), flux in zip(steps, fluxes, strict=True):
+        out = out + jnp.maximum(near(flux, width), 0.0)
+        out = out + jnp.maximum(-near(flux, width, -shift, -layer), 0.0)
     # Shares of a cell that leave it, together less than 1 by more than rounding.
-    limit = jnp.maximum(1.000001 * out, jnp.maximum(fill, TINY))
-    moved, stays = 0.0, 1.0
-    for k, axis in enumerate(AXES):
-        m = 4 + axis if k < 2 else 0
-        for leaving, arrive in ((right[k], _last), (left[k], _next)):
-            share = leaving / limit
-            stays = stays - share
-            moved = moved + arrive(paint * share[:, None], m)
-    return paint * stays[:, None] + moved
+    by = wide(1.0 / jnp.maximum(1.000001 * out, jnp.maximum(here, TINY)), width)
+    stays, moved = 1.0, 0.0
+    paint = wide(paint, width)
+    for (shift, layer), flux in zip(steps, fluxes, strict=True):
+        # Share of the cell it leaves, with the sign of the flux.
+        go = near(flux, width)
+        go = go * jnp.where(go > 0.0, near(by, width), near(by, width, shift, layer))
+        go = wide(go, width)
+        ahead, behind = near(go, width), near(go, width, -shift, -layer)
+        stays = stays - jnp.maximum(ahead, 0.0) - jnp.maximum(-behind, 0.0)
+        moved = moved + jnp.maximum(behind, 0.0)[:, None] * near(paint, width, -shift, -layer)
+        moved = moved + jnp.maximum(-ahead, 0.0)[:, None] * near(paint, width, shift, layer)
+    return near(paint, width) * stays[:, None] + moved
 
 
 def repack(paint, capacity):
     """Columns without overfull cells and without holes, order kept; the top cell keeps any rest.
 
     Args:
-      paint: (z, k, y, x). capacity: (z, y, x) share of each cell that paint may fill.
+      paint: (z, k, n). capacity: (z, n) share of each cell that paint may fill.
     """
-    layers = paint
 
     def push(carry, inputs):
         cell, room = inputs
@@ -73,7 +78,7 @@ def repack(paint, capacity):
         stay = cell * keep[None]
         return cell - stay, stay
 
-    rest, layers = jax.lax.scan(push, jnp.zeros_like(layers[0]), (layers, capacity))
+    rest, layers = jax.lax.scan(push, jnp.zeros_like(paint[0]), (paint, capacity))
     layers = jnp.concatenate([layers[:-1], layers[-1:] + rest[None]])
 
     def pull(cell, inputs):
@@ -89,43 +94,47 @@ def repack(paint, capacity):
     return jnp.concatenate([lower, top[None]])
 
 
-def slump(config: PaintConfig, params: PaintParams, paint, near, step):
+def slump(config: PaintConfig, params: PaintParams, paint, hairy, step):
     """Lets steep steps of the surface fall towards lower neighbours near the hair.
 
     Args:
-      near: (y, x) 1 where hair is close. step: () travel of the brush [mm].
+      paint: (z, k, n). hairy: (n,) 1 where hair is close. step: () travel of the brush [mm].
     """
-    fill = jnp.sum(paint, axis=1)
-    height = jnp.sum(fill, axis=0)
+    width, one = config.window, 1.0 + 0.0 * step
+    flat = lambda columns: wide(columns[None], width)  # noqa: E731
+    at = lambda planes, shift=0: near(planes, width, shift)[0]  # noqa: E731
+
+    def down(carry, cell):
+        # The paint that can move: the topmost cells of a column, 1.5 deep.
+        above, column = carry
+        fill = jnp.sum(cell, axis=0)
+        loose = jnp.clip(1.5 - above, 0.0, fill) / jnp.maximum(fill, TINY)
+        return (above + fill, column + cell * loose[None]), loose
+
+    start = (jnp.zeros_like(paint[0, 0]), jnp.zeros_like(paint[0]))
+    (height, column), loose = jax.lax.scan(down, start, paint, reverse=True)
     rate = 0.25 * (1.0 - jnp.exp(-4.0 * params.relax * step))
     stands = params.relax_slope / config.layer
-    # The paint that can move: the topmost cells of a column, 1.5 deep.
-    above = jnp.flip(jnp.cumsum(jnp.flip(fill, 0), axis=0), 0) - fill
-    loose = jnp.clip(1.5 - above, 0.0, fill)
-    loose = paint * (loose / jnp.maximum(fill, TINY))[:, None]
-    amount = jnp.maximum(jnp.sum(loose, axis=(0, 1)), TINY)
-    h, w = height.shape
-    edge_y = (jnp.arange(h) < h - 1).astype(paint.dtype)[:, None]
-    edge_x = (jnp.arange(w) < w - 1).astype(paint.dtype)[None]
-    out, moves = 0.0, []
-    for n, edge in ((0, edge_y), (1, edge_x)):
-        drop = height - _next(height, n)
+    high, close = flat(height), flat(hairy)
+    fluxes, out = [], 0.0
+    for shift, inner in ((1, inner_x(width, width)), (width, inner_y(width, width))):
+        drop = height - at(high, shift)
         size = jnp.maximum(jnp.abs(drop) - stands, 0.0) * jnp.sign(drop)
-        flux = rate * size * edge * jnp.maximum(near, _next(near, n))
-        moves.append(flux)
-        out = out + jnp.maximum(flux, 0.0) + _last(jnp.maximum(-flux, 0.0), n)
+        flux = rate * size * jnp.asarray(inner, paint.dtype) * jnp.maximum(hairy, at(close, shift))
+        fluxes.append(flat(flux))
+        out = out + jnp.maximum(flux, 0.0) + jnp.maximum(-at(fluxes[-1], -shift), 0.0)
+    amount = jnp.maximum(jnp.sum(column, axis=0), TINY)
+    # Of what is loose, the share that moves for each unit of flux.
     scale = jnp.minimum(1.0, 0.9 * amount / jnp.maximum(out, TINY)) / amount
-    layers = paint.shape[0]
-    top = jnp.clip(jnp.floor(height), 0.0, layers - 1.0)
-    level = jnp.arange(layers, dtype=paint.dtype)[:, None, None]
-    landing = (level == top[None]).astype(paint.dtype)
-    column = jnp.sum(loose, axis=0)
+    by, column = flat(scale), wide(column[None], width)
     gained, lost = 0.0, 0.0
-    for n, flux in enumerate(moves):
-        forward = jnp.maximum(flux, 0.0) * scale
-        back = jnp.maximum(-flux, 0.0)
-        here = back * _next(scale, n)
-        lost = lost + forward + _last(here, n)
-        arrives = _last(forward[None] * column, n + 1) + here[None] * _next(column, n + 1)
-        gained = gained + arrives
-    return paint - loose * lost[None, None] + gained[None] * landing[:, None]
+    for shift, flux in zip((1, width), fluxes, strict=True):
+        ahead, behind = at(flux), at(flux, -shift)
+        lost = lost + (jnp.maximum(ahead, 0.0) + jnp.maximum(-behind, 0.0)) * scale
+        gained = gained + (jnp.maximum(behind, 0.0) * at(by, -shift))[None] * at(column, -shift)
+        gained = gained + (jnp.maximum(-ahead, 0.0) * at(by, shift))[None] * at(column, shift)
+    top = jnp.clip(jnp.floor(height), 0.0, paint.shape[0] - 1.0)
+    level = jnp.arange(paint.shape[0], dtype=paint.dtype)[:, None]
+    landing = (level == top[None]).astype(paint.dtype)
+    lost, gained = lost / one, gained / one
+    return paint * (1.0 - loose * lost[None])[:, None] + gained[None] * landing[:, None]

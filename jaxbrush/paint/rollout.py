@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jaxbrush.paint.advection import advect, repack, slump
 from jaxbrush.paint.hair import hair
 from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams
+from jaxbrush.paint.stencil import stored
 from jaxbrush.paint.transfer import refill, ride, transfer
 from jaxbrush.paint.velocity import flow, splat
 from jaxbrush.structs import state
@@ -30,16 +31,6 @@ def _near(field, cells: int):
     )
 
 
-def stored(tree, one):
-    """The same values, as arrays that XLA keeps instead of working them out again for each reader:
-    it never repeats a division. (The CPU back end drops `optimization_barrier`.)
-
-    Args:
-      one: () traced 1.0.
-    """
-    return jax.tree.map(lambda x: x / one, tree)
-
-
 def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, points, tooth):
     """One stamp on a window.
 
@@ -50,19 +41,21 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
       (paint, brush, residual (4,)).
     """
     one = 1.0 + 0.0 * points.step
+    shape = paint.shape
     paint, brush = transfer(config, params, paint, brush, points, tooth)
     paint = stored(paint, one)
     brush = refill(config, params, brush, points.travel)
     z, _ = ride(config, params, paint, points)
-    phi, motion = stored(splat(config, points, z, (paint.shape[0], *paint.shape[2:])), one)
+    phi, motion = stored(splat(config, points, z), one)
+    paint = paint.reshape(*shape[:2], -1)
+    hairy = (jnp.sum(phi, axis=0) > 0.0).astype(paint.dtype).reshape(shape[2:])
+    paint = slump(config, params, paint, _near(hairy, 2).reshape(-1), points.step)
+    paint = stored(paint, one)
     fill = stored(jnp.sum(paint, axis=1), one)
     moved = flow(config, params, fill, phi, motion, points.step)
-    paint = stored(advect(config, paint, stored(moved.face, one)), one)
+    paint = stored(advect(config, paint, moved.face), one)
     paint = repack(paint, 1.0 - phi)
-    hairy = (jnp.sum(phi, axis=0) > 0.0).astype(paint.dtype)
-    paint = stored(slump(config, params, paint, _near(hairy, 2), points.step), one)
-    paint = repack(paint, 1.0 - phi)
-    return paint, brush, moved.residual
+    return paint.reshape(shape), brush, moved.residual
 
 
 def paint_stroke(

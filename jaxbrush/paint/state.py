@@ -17,7 +17,8 @@ class PaintConfig:
     window: cells along a side of the region that is simulated, around the brush. pigments: how
     many are mixed. samples: points on each bristle's lowest part. sweeps: points of each along its
     way from stamp to stamp. viscous, pressure: iterations. solver: of the pressure, one of
-    `SOLVERS`. limiter: second-order lateral fluxes.
+    `SOLVERS`. spectrum: radius that Chebyshev's iteration is made for, below 1. limiter:
+    second-order lateral fluxes.
     """
 
     pixel: float = 0.125
@@ -27,15 +28,16 @@ class PaintConfig:
     pigments: int = 4
     samples: int = 4
     sweeps: int = 2
-    viscous: int = 5
+    viscous: int = 6
     pressure: int = 10
-    solver: str = "zline_pcg"
+    solver: str = "chebyshev"
+    spectrum: float = 0.9
     limiter: bool = True
 
     def __post_init__(self):
         for name, least in (
             ("layers", 2), ("window", 8), ("pigments", 1), ("samples", 1), ("sweeps", 1),
-            ("viscous", 0), ("pressure", 0),
+            ("viscous", 1), ("pressure", 1),
         ):  # fmt: skip
             value = getattr(self, name)
             if not isinstance(value, int) or value < least:
@@ -43,6 +45,8 @@ class PaintConfig:
         for name in ("pixel", "layer"):
             if not getattr(self, name) > 0.0:
                 raise ValueError(f"PaintConfig.{name} = {getattr(self, name)!r}: expected > 0 mm")
+        if not 0.0 <= self.spectrum < 1.0:
+            raise ValueError(f"PaintConfig.spectrum = {self.spectrum!r}: expected in [0, 1)")
         if self.solver not in SOLVERS:
             raise ValueError(f"PaintConfig.solver = {self.solver!r}: expected one of {SOLVERS}")
 
@@ -74,6 +78,7 @@ class PaintParams:
     reservoir_volume: jax.Array  # capacity of the brush behind them [mm^3]
     contact_area: jax.Array  # over which all bristles together touch [mm^2]
     deposit: jax.Array  # [1/mm]
+    cling: jax.Array  # a hair that rises as 1 in this gives nothing
     squeeze: jax.Array  # [1/mm]
     pickup: jax.Array  # [1/mm]
     exchange: jax.Array  # [1/mm]
@@ -95,10 +100,10 @@ def make_params(**changes) -> PaintParams:
       ValueError: a name that is not a constant.
     """
     values = {
-        "hair_radius": 0.05, "hair_length": 0.9, "coat_dry": 0.2, "coat_full": 5.0,
+        "hair_radius": 0.03, "hair_length": 0.9, "coat_dry": 0.33, "coat_full": 8.0,
         "compliance": 0.4, "tip_volume": 7.5, "reservoir_volume": 63.0, "contact_area": 20.0,
-        "deposit": 12.8, "squeeze": 0.4, "pickup": 4.0, "exchange": 0.48, "refill": 0.8,
-        "soak": 10.0, "drag": 256.0, "lid": 0.9, "source": 1.0, "yield_share": 0.02,
+        "deposit": 12.8, "squeeze": 0.4, "cling": 4.0, "pickup": 4.0, "exchange": 0.48,
+        "refill": 0.8, "soak": 10.0, "drag": 256.0, "lid": 0.9, "source": 1.0, "yield_share": 0.02,
         "relax": 1.0, "relax_slope": 0.094, "opacity": 0.03,
     }  # fmt: skip
     unknown = set(changes) - set(values)

@@ -64,7 +64,11 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
 
     wanted = jnp.clip(even - film, 0.0, 2.0 * coat[None])
     give = rate(params.deposit) * touch * wanted * area
-    give = give * jnp.clip(2.0 * load, 0.0, 1.0)[None] * jnp.clip(1.0 - rising, 0.0, 1.0)
+    give = (
+        give
+        * jnp.clip(2.0 * load, 0.0, 1.0)[None]
+        * jnp.clip(1.0 - params.cling * rising, 0.0, 1.0)
+    )
     spare = jnp.maximum(held - 0.7 * capacity, 0.0)[None] / points
     give = give + rate(params.squeeze) * touch * spare
     lift = rate(params.pickup) * touch * jnp.clip(film - even, 0.0, 3.0 * radius) * area

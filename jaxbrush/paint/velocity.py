@@ -5,39 +5,39 @@ each stamp solves for the displacement of the paint, dragged by the hair (Brinkm
 canvas, free at its surface; then makes it incompressible. Viscosity cancels, for drag and
 viscous stress both grow with it.
 
-Displacements are in cells a stamp, on the faces between a cell and the next along x, y, z: a list
-of three (z, y, x). The outermost faces do not move.
+Fields are flat planes (z, n), n = y * x. Displacements are in cells a stamp; those on faces, a
+list along x, y, z, lie between a cell and the next, and the outermost faces do not move.
 """
 
 import jax
 import jax.numpy as jnp
 
 from jaxbrush.paint.hair import Hair, corners
-from jaxbrush.paint.solvers import Matrix, _last, _next, solve
+from jaxbrush.paint.solvers import Matrix, residual, solve
 from jaxbrush.paint.state import PaintConfig, PaintParams
+from jaxbrush.paint.stencil import inner_x, inner_y, near, wide
 from jaxbrush.structs import state
-
-AXES = (-1, -2, -3)
 
 
 @state
 class Flow:
-    """face: displacement along x, y, z, each (z, y, x) [cells]. residual: (4,) of the three
-    viscous solves and the pressure, relative."""
+    """face: displacement along x, y, z, each (z + 2, n + 2 width), wide [cells]. residual: (4,) of
+    the viscous solves and the pressure, relative."""
 
     face: list
     residual: jax.Array
 
 
-def splat(config: PaintConfig, hair: Hair, z, shape):
+def splat(config: PaintConfig, hair: Hair, z):
     """Hair in each cell.
 
     Args:
-      z: (s, b) heights of the points after riding up [mm]. shape: (z, y, x).
+      z: (s, b) heights of the points after riding up [mm].
 
     Returns:
-      (phi (z, y, x) share of the cell, at most 0.5; motion (3, z, y, x) mean [cells]).
+      (phi (z, n) share of the cell, at most 0.5; motion (z, 3, n) mean [cells]).
     """
+    shape = (config.layers, config.window, config.window)
     scale = jnp.asarray([config.pixel, config.pixel, config.layer], z.dtype)[:, None, None]
     place = jnp.stack([hair.place[0], hair.place[1], z]) / scale - 0.5
     index, share = corners(config, place.reshape(3, -1), shape)
@@ -45,65 +45,58 @@ def splat(config: PaintConfig, hair: Hair, z, shape):
     motion = hair.motion / scale
     # Hair that leaves the paint upwards lets go of it.
     motion = motion.at[2].multiply(jnp.where(motion[2] > 0.0, 0.3, 1.0)).reshape(3, 1, -1)
-    cells = shape[0] * shape[1] * shape[2]
+    plane = config.window**2
     rows = jnp.concatenate([mass[None], mass[None] * motion])
-    number = jnp.arange(4, dtype=jnp.int32)[:, None, None] * cells + index[None]
-    total = jnp.zeros(4 * cells, z.dtype).at[number].add(rows).reshape(4, *shape)
-    phi = jnp.minimum(total[0], 0.5)
-    return phi, total[1:] / jnp.maximum(total[:1], 1e-9)
-
-
-def _face(a, axis, combine):
-    return combine(a, _next(a, a.ndim + axis))
-
-
-def _not_last(shape, axis, dtype):
-    """1 on the faces inside the grid, 0 on its last ones along `axis`."""
-    n = shape[axis]
-    inside = (jnp.arange(n) < n - 1).astype(dtype)
-    form = [1, 1, 1]
-    form[axis] = n
-    return inside.reshape(form)
+    # (4, 8, n) into (z, 4, n)
+    level, column = index // plane, index % plane
+    number = (4 * level[None] + jnp.arange(4, dtype=jnp.int32)[:, None, None]) * plane + column[
+        None
+    ]
+    total = jnp.zeros(4 * shape[0] * plane, z.dtype).at[number].add(rows)
+    total = total.reshape(shape[0], 4, plane)
+    phi = jnp.minimum(total[:, 0], 0.5)
+    return phi, total[:, 1:] / jnp.maximum(total[:, :1], 1e-9)
 
 
 def viscous(config: PaintConfig, params: PaintParams, fill, phi, motion):
-    """Displacement of dragged, sticky paint, three (z, y, x), and residuals (3,).
+    """Displacement of dragged, sticky paint, (z, 3, n + 2 width), and residuals (3,).
 
-    Solves (beta + L) u = beta u_hair for each component on its faces: beta = drag * phi * pixel^2;
-    L the viscous 7-point operator, weighted by wetness (no stress at air), no slip on the canvas.
+    Solves (beta + L) u = beta u_hair in the cells: beta = drag * phi * pixel^2; L the viscous
+    7-point operator, weighted by wetness (no stress at air), no slip on the canvas, half a cell
+    below the first layer.
     """
+    one = 1.0 + 0.0 * params.drag
     wet = jnp.clip(fill + phi, 0.0, 1.0)
-    shape, dtype, r2 = fill.shape, fill.dtype, config.ratio
-    parts = []
-    for k, axis in enumerate(AXES):
-        inside = _not_last(shape, axis, dtype)
-        w = _face(wet, axis, jnp.minimum) * inside
-        hair = _face(phi, axis, lambda a, b: 0.5 * (a + b)) * inside
-        pull = _face(phi * motion[k], axis, lambda a, b: 0.5 * (a + b)) * inside
-        x = jnp.minimum(w, _next(w, 2))
-        y = jnp.minimum(w, _next(w, 1))
-        z = r2 * jnp.minimum(w, _next(w, 0))
-        diagonal = x + _last(x, 2) + y + _last(y, 1) + z + _last(z, 0)
-        if k < 2:
-            # The canvas is half a cell below the first layer and does not slip.
-            floor = jnp.zeros(shape[0], dtype).at[0].set(2.0 * r2)
-            diagonal = diagonal + floor[:, None, None] * w
-        else:
-            floor = jnp.zeros(shape[0], dtype).at[0].set(r2)
-            diagonal = diagonal + floor[:, None, None] * w
-        beta = params.drag * config.pixel**2
-        # Dry faces do not move, and must not make the matrix singular.
-        diagonal = diagonal + beta * hair + 1e-3
-        parts.append((Matrix(diagonal, x, y, z), beta * pull))
-    matrix = jax.tree.map(lambda *a: jnp.stack(a, axis=1), *[p[0] for p in parts])
-    rhs = jnp.stack([p[1] for p in parts], axis=1)
-    face, residual = solve("zline_pcg", matrix, rhs, config.viscous)
-    return [face[:, k] for k in range(3)], residual
+    beta = params.drag * config.pixel**2 * phi
+    floor = jnp.zeros((config.layers, 1), fill.dtype).at[0].set(2.0 * config.ratio)
+    # Dry cells do not move, and must not make the matrix singular.
+    extra = (beta + floor * wet + 1e-3) / one
+    matrix = Matrix(wide(wet, config.window), extra, config.ratio, config.window)
+    rhs = beta[:, None] * motion / one
+    u = solve("chebyshev", matrix, rhs, config.viscous, config.spectrum)
+    return u, residual(matrix, u[..., config.window : -config.window], rhs)
 
 
-def divergence(face):
-    """(z, y, x) of face displacements."""
-    return sum(face[k] - _last(face[k], 3 + axis) for k, axis in enumerate(AXES))
+def faces_of(config: PaintConfig, u):
+    """Displacements of cells, (z, 3, n + 2 width), on the faces between them, each (z, n)."""
+    size = config.window
+    inside = (inner_x(size, size), inner_y(size, size))
+    faces = []
+    for k, shift in enumerate((1, size)):
+        here = jax.lax.slice_in_dim(u[:, k], size, -size, axis=1)
+        there = u[:, k, size + shift : u.shape[2] - size + shift]
+        faces.append(0.5 * (here + there) * jnp.asarray(inside[k], u.dtype)[None])
+    here = u[:, 2, size:-size]
+    up = 0.5 * (here[:-1] + here[1:])
+    return [*faces, jnp.concatenate([up, jnp.zeros_like(up[:1])])]
+
+
+def divergence(face, width: int):
+    """(z, n) of wide face displacements."""
+    total = 0.0
+    for f, shift, layer in zip(face, (-1, -width, 0), (0, 0, -1), strict=True):
+        total = total + near(f, width) - near(f, width, shift, layer)
+    return total
 
 
 def project(config: PaintConfig, params: PaintParams, fill, phi, face):
@@ -113,58 +106,85 @@ def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     of hair is full of paint that cannot escape upwards for free, so faces from liquid up into air
     open only as far as there is no hair.
 
+    Args:
+      face: wide displacements.
+
     Returns:
-      (three faces (z, y, x), relative residual ()).
+      (three faces (z, n), relative residual (1,)).
     """
+    one, width = 1.0 + 0.0 * params.drag, config.window
     liquid = (fill + phi >= 0.5).astype(fill.dtype)
     source = params.source * jnp.maximum(fill + phi - 1.0, 0.0)
-    lid = 1.0 - params.lid * jnp.minimum(1.0, phi / 0.15)
-    weights, coupling, diagonal = [], [], 0.0
-    for k, axis in enumerate(AXES):
-        n = 3 + axis
-        inside = _not_last(fill.shape, axis, fill.dtype)
-        either = jnp.maximum(liquid, _next(liquid, n)) * inside
-        both = liquid * _next(liquid, n) * inside
-        scale = config.ratio if k == 2 else 1.0
-        open_ = jnp.maximum(both, either * lid) if k == 2 else either
-        weight = scale * open_
-        weights.append(weight)
-        coupling.append(scale * both)
-        diagonal = diagonal + weight + _last(weight, n)
-    diagonal = jnp.where(liquid > 0.0, diagonal, 1.0)
-    diagonal = jnp.maximum(diagonal, 1e-6)
-    matrix = Matrix(diagonal, *coupling)
-    rhs = liquid * (source - divergence(face))
-    pressure, residual = solve(config.solver, matrix, rhs, config.pressure)
-    pressure = pressure * liquid
-    moved = [
-        face[k] - weights[k] * (_next(pressure, 3 + axis) - pressure) for k, axis in enumerate(AXES)
-    ]
-    return moved, residual
+    lid = wide(1.0 - params.lid * jnp.minimum(1.0, phi / 0.15), width)
+    wet = wide(liquid, width)
+    walls = [(inner_x(width, width, k), inner_y(width, width, k * width)) for k in (-1, 0)]
+    shifts = (1, width)
+
+    # What a liquid cell adds for its neighbours of air.
+    here, extra = near(wet, width), 0.0
+    for axis, shift in enumerate(shifts):
+        for sign, wall in ((-1, walls[0][axis]), (1, walls[1][axis])):
+            air = 1.0 - near(wet, width, sign * shift)
+            extra = extra + jnp.asarray(wall, fill.dtype)[None] * air
+    above, below = near(wet, width, 0, 1), near(wet, width, 0, -1)
+    top = jnp.ones((config.layers, 1), fill.dtype).at[-1].set(0.0)
+    bottom = jnp.ones((config.layers, 1), fill.dtype).at[0].set(0.0)
+    open_ = top * (1.0 - above) * near(lid, width) + bottom * (1.0 - below) * near(
+        lid, width, 0, -1
+    )
+    extra = jnp.where(here > 0.0, extra + config.ratio * open_, 1.0)
+    matrix = Matrix(wet, jnp.maximum(extra, 1e-6) / one, config.ratio, width)
+    rhs = (liquid * (source - divergence(face, width)))[:, None] / one
+    p = solve(config.solver, matrix, rhs, config.pressure, config.spectrum)
+    left = residual(matrix, p[..., width:-width], rhs)
+    p = jnp.pad(p[:, 0], ((1, 1), (0, 0)))
+
+    moved = []
+    for axis, shift in enumerate(shifts):
+        weight = jnp.maximum(here, near(wet, width, shift))
+        weight = weight * jnp.asarray(walls[1][axis], fill.dtype)[None]
+        drop = near(p, width, shift) - near(p, width)
+        moved.append(near(face[axis], width) - weight * drop)
+    weight = jnp.maximum(here * above, jnp.maximum(here, above) * near(lid, width)) * top
+    drop = near(p, width, 0, 1) - near(p, width)
+    moved.append(near(face[2], width) - config.ratio * weight * drop)
+    return moved, left
 
 
 def stop(params: PaintParams, config: PaintConfig, face, step):
     """Yield: paint that would move less than a share of the brush's travel stands still.
 
-    A cut on speed, in place of a stress: smooth above the threshold.
+    A cut on the square of speed, in place of a stress: smooth above the threshold, and no root.
 
     Args:
-      step: () travel of the brush in the stamp [mm].
+      face: wide displacements. step: () travel of the brush in the stamp [mm].
+
+    Returns:
+      Wide displacements.
     """
+    width = config.window
     # A brush at rest moves nothing either, and no rounding does.
     threshold = jnp.maximum(params.yield_share * step / config.pixel, 1e-4)
     square = 0.0
-    for k, axis in enumerate(AXES):
-        scale = config.layer / config.pixel if k == 2 else 1.0
-        middle = 0.5 * scale * (face[k] + _last(face[k], 3 + axis))
+    for f, shift, layer in zip(face, (-1, -width, 0), (0, 0, -1), strict=True):
+        scale = config.layer / config.pixel if layer else 1.0
+        middle = 0.5 * scale * (near(f, width) + near(f, width, shift, layer))
         square = square + middle * middle
-    keep = jnp.clip(1.0 - threshold / jnp.sqrt(square + 1e-12), 0.0, 1.0)
-    return [face[k] * jnp.maximum(keep, _next(keep, 3 + axis)) for k, axis in enumerate(AXES)]
+    keep = wide(jnp.clip(1.0 - threshold**2 / (square + 1e-12), 0.0, 1.0), width)
+    ends = zip(face, (1, width, 0), (0, 0, 1), strict=True)
+    return [
+        wide(
+            near(f, width) * jnp.maximum(near(keep, width), near(keep, width, shift, layer)), width
+        )
+        for f, shift, layer in ends
+    ]
 
 
 def flow(config: PaintConfig, params: PaintParams, fill, phi, motion, step) -> Flow:
-    """Displacement of the paint in one stamp."""
-    face, rough = viscous(config, params, fill, phi, motion)
-    face, residual = project(config, params, fill, phi, face)
-    face = stop(params, config, face, step)
-    return Flow(face=face, residual=jnp.concatenate([rough, residual[None]]))
+    """Displacement of the paint in one stamp: fill, phi (z, n), motion (z, 3, n)."""
+    width = config.window
+    u, rough = viscous(config, params, fill, phi, motion)
+    face = [wide(f, width) for f in faces_of(config, u)]
+    face, left = project(config, params, fill, phi, face)
+    face = stop(params, config, [wide(f, width) for f in face], step)
+    return Flow(face=face, residual=jnp.concatenate([rough, left]))
