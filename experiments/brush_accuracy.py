@@ -247,9 +247,9 @@ def chart(points: list[Point], default: Point, own: Errors, peers: dict, options
                   alpha=0.5, label="no setting is faster and better", zorder=2)  # fmt: skip
         axis.scatter([value(default)], [default.time.low * 1e3], s=260, facecolor="none",
                      edgecolor=INK, lw=1.6, label="default", zorder=4)  # fmt: skip
-        for text, peer in peers.items():
-            axis.scatter([value(default)], [peer * 1e3], marker="*", s=120, color=COLORS[2],
-                         label=text, zorder=3)  # fmt: skip
+        for (text, peer), mark in zip(peers.items(), ("*", "P", "X", "D"), strict=False):
+            axis.scatter([value(default)], [peer[0].low * 1e3], marker=mark, s=90, zorder=3,
+                         color=COLORS[2], edgecolor=INK, lw=0.5, label=text)  # fmt: skip
         axis.axhline(FEEL, color=INK, lw=0.8, ls=(0, (4, 3)))
         axis.axvline(bar, color=INK, lw=0.8, ls=(0, (4, 3)))
         axis.axvspan(getattr(own, name) * 0.5, getattr(own, name), color="#efeae3", zorder=0)
@@ -274,7 +274,7 @@ def chart(points: list[Point], default: Point, own: Errors, peers: dict, options
     save_figure(figure, path)
 
 
-def table(points, default, explicit, own, side, peers, lower) -> None:
+def table(points, default, explicit, own, side, beside, peers, lower) -> None:
     """Prints what a reader decides by; the default in bold."""
     number = lambda x: f"{x:.3g}" if np.isfinite(x) and x < 1e3 else "blown up"  # noqa: E731
     chosen = frontier([p for p in points if p.error.finite], lambda p: p.error.tip)
@@ -286,11 +286,11 @@ def table(points, default, explicit, own, side, peers, lower) -> None:
             [str(point.setting), *(number(x) for x in dataclasses.astuple(point.error)),
              str(point.time), f"{point.time.low / default.time.low:.2f}"]
         )  # fmt: skip
-    for name, peer in peers.items():
-        cells = ["", "", "", "", ""] if peer is None else [
-            f"max {peer[1]:.1e} mm", f"max {100 * peer[2]:.1e}", "", str(peer[0]),
-            f"{peer[0].low / default.time.low:.2f}"]  # fmt: skip
-        rows.append([name, *cells])
+    if peers:
+        rows.append(["default, in turns with numba", "", "", "", str(beside), "1"])
+    for name, (time, tip, force) in peers.items():
+        rows.append([name, f"max {tip:.1e} mm", f"max {100 * force:.1e}", "", str(time),
+                     f"{time.low / beside.low:.2f}"])  # fmt: skip
     total = max(lower["arithmetic_s"], lower["memory_s"])
     rows.append(["floor: arithmetic and memory", "", "", "", f"{total * 1e3:.3g}",
                  f"{total / default.time.low:.3f}"])  # fmt: skip
@@ -337,12 +337,9 @@ def main(options: Config) -> None:
             default.setting.config, options.bristles,
             stroke.time.shape[0], operations,
         )  # fmt: skip
-        peers = {}
-        for name, parallel in (("numba, one core", False), ("numba, all cores", True)):
-            peer = brush_costs.numba_peer(
-                default.setting.config, params, options.strokes[0], parallel, options.repeats
-            )
-            peers[name if peer else f"{name}: not installed (pip install -e .[dev])"] = peer
+        beside, peers = brush_costs.numba_peers(
+            default.setting.config, params, options.strokes[0], options.repeats
+        )
         stability = None
         if options.stability:
             stability = brush_stability.run(options.quick, folder, progress)
@@ -352,8 +349,7 @@ def main(options: Config) -> None:
     steady = [p for p in explicit if p.error.finite and p.error.tip < 100.0]
     match = min(below or steady or explicit, key=lambda p: p.time.low)
     ratio = match.time.low / default.time.low
-    found = {name: peer[0].low for name, peer in peers.items() if peer}
-    chart(points, default, own, found, options, folder / "accuracy.png")
+    chart(points, default, own, peers, options, folder / "accuracy.png")
     rows = [("true hair against softened length", side["axial"])]
     for kind, (converged, usual) in side["inertia"].items():
         rows.append((f"{kind}: without inertia, converged", converged))
@@ -364,18 +360,21 @@ def main(options: Config) -> None:
         {
             "points": points, "reference_error": own, "default": default, "explicit": match,
             "explicit_over_default": ratio, "model": side, "stability": stability,
-            "peers": {
-                k: v and {"time": v[0], "tip_mm": v[1], "force": v[2]} for k, v in peers.items()
-            },
+            "default_beside_peers": beside,
+            "peers": {k: {"time": v[0], "tip_mm": v[1], "force": v[2]} for k, v in peers.items()},
             "floor": lower,
         },
     )  # fmt: skip
-    table(points, default, match, own, rows, peers, lower)
+    table(points, default, match, own, rows, beside, peers, lower)
     limit = max(lower["arithmetic_s"], lower["memory_s"])
     console.print(
         f"Explicit at the default's error or better takes {ratio:.1f} x the default's time. The "
         f"default is {default.time.low / limit:.1f} x above the floor of arithmetic and memory."
     )
+    for name, peer in peers.items():
+        console.print(f"{name}: {peer[0].low / beside.low:.2f} of the default's time.")
+    if not peers:
+        console.print("No numba beside it: pip install -e .[dev]")
 
 
 if __name__ == "__main__":

@@ -2,17 +2,26 @@
 
 import re
 import time
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from experiments import brush_numba
+from experiments import brush_lanes, brush_numba
 from experiments.brush_cases import STAMP, roll, single, stroke_of
-from experiments.common import timed
+from experiments.common import Timing, timed
 from jaxbrush.brush import BrushConfig
 from jaxbrush.brush.handle import poses
 from jaxbrush.brush.rollout import solved_stamps
+
+NUMBA = {
+    "plain numba loops, one core": (brush_numba, False),
+    "plain numba loops, all cores": (brush_numba, True),
+    "blocked numba loops, one core": (brush_lanes, False),
+    "blocked numba loops, all cores": (brush_lanes, True),
+}
+"""Peers by name: the module, and whether bristles spread over cores."""
 
 
 def step_flops(nodes: int, iterations: int, contact_nodes: int) -> int:
@@ -106,18 +115,16 @@ def floor(config: BrushConfig, bristles: int, stamps: int, operations: tuple[int
     }
 
 
-def numba_peer(config: BrushConfig, params, kind: str, parallel: bool, repeats: int):
+def numba_peers(config: BrushConfig, params, kind: str, repeats: int):
     """Time and agreement of the numba loops on one stroke, at the stamps that the default solves.
 
-    In numba's favour, poses are made beforehand and the stamps between are not filled in.
+    In numba's favour, poses are made beforehand and the stamps between are not filled in. All
+    take turns, so that a busy machine is busy for each.
 
     Returns:
-      (Timing, largest distance of a tip from JAX's [mm], largest difference of a bristle's force
-      over the largest force), or None without numba.
+      (Timing of `config` itself, {name: (Timing, largest distance of a tip from JAX's [mm],
+      largest difference of a bristle's force over the largest force)}, empty without numba).
     """
-    run = brush_numba.make_rollout(config, parallel)
-    if run is None:
-        return None
     with jax.enable_x64(True):
         stroke = stroke_of(kind, STAMP)
     stroke, params = single(stroke), single(params)
@@ -125,10 +132,21 @@ def numba_peer(config: BrushConfig, params, kind: str, parallel: bool, repeats: 
     track = roll(config, params, stroke)
     tip, pressed = track.position[solved, -1], track.force[solved].sum(1)
     few = jax.tree.map(lambda x: x[solved], stroke)
-    arrays = brush_numba.inputs(config, params, poses(params, few, config.approach))
-    (position, force), timing = timed(run, *arrays, repeats=repeats)
-    position = brush_numba.joined(position)[config.approach :]
-    force = brush_numba.joined(force)[config.approach :].sum(1)
-    apart = float(np.max(np.abs(position[:, -1] - tip)))
-    off = float(np.max(np.abs(force - pressed)) / np.max(pressed))
-    return timing, apart, off
+    pose = poses(params, few, config.approach)
+    runs, apart = {"": lambda: roll(config, params, stroke)}, {}
+    for name, (module, parallel) in NUMBA.items() if brush_numba.numba else ():
+        run = partial(module.make_rollout(config, parallel), *module.inputs(config, params, pose))
+        position, force = (x[config.approach :] for x in module.arranged(*run()))
+        far = float(np.max(np.abs(position[:, -1] - tip)))
+        runs[name] = run
+        apart[name] = far, float(np.max(np.abs(force.sum(1) - pressed)) / np.max(pressed))
+    turns = [{k: timed(run, repeats=3)[1] for k, run in runs.items()} for _ in range(repeats)]
+    times = {
+        k: Timing(
+            turns[0][k].first,
+            min(turn[k].low for turn in turns),
+            float(np.median([turn[k].median for turn in turns])),
+        )
+        for k in runs
+    }
+    return times.pop(""), {k: (times[k], *apart[k]) for k in times}

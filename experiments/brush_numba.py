@@ -1,11 +1,9 @@
 """The same brush as plain loops: the quasi-static projective step of `jaxbrush`, in numba.
 
-A peer to measure against, written the way one writes fast loops by hand. Bristles are independent
-given the handle's path, so a block of `LANES` bristles runs through the whole stroke with its
-state in the first cache level, in float32 with fast-math. The innermost loop is over lanes, and
-all rows of lanes live in one buffer at constant places, so that the compiler sees that they do not
-overlap and fills vector registers. The inverse factor of the bending matrix is applied by
-substitution, 4 operations a segment instead of a row of a matrix.
+A peer to measure against, written the way one first writes it: for each bristle, for each stamp,
+for each segment. Bristles are independent given the handle's path. The inverse factor of the
+bending matrix is applied by substitution, 4 operations a segment instead of a row of a matrix.
+`brush_lanes` is the same blocked by hand; both share the friction here.
 """
 
 import numpy as np
@@ -15,42 +13,48 @@ try:
 except ImportError:
     numba = None
 
-LANES = 16
+# float32 like jaxbrush: a bare 0.0 would make the loops double.
+Z, ONE, TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-12)
+
+
+def compiled(**options):
+    """numba.njit with sums reordered at will and no checks of division; nothing without numba."""
+    if numba is None:
+        return lambda function: function
+    return numba.njit(fastmath=True, error_model="numpy", **options)
 
 
 def inputs(config, params, pose):
     """Arrays for the loops, from a brush and its handle poses (leading axis t), as float32.
 
     Args:
-      config: BrushConfig. params: BrushParams of b bristles, a multiple of `LANES`.
+      config: BrushConfig. params: BrushParams of b bristles.
       pose: Pose with t steps, approach included.
 
     Returns:
-      The arguments of the functions made by `make_rollout`: the brush in g blocks of rows,
-      (g, 6 + 3 n, l): clamp point (3), segment length, EI / l0^3, compliance along the bristle,
-      rest directions; friction; pivots and subdiagonal of the factor (n,); origin (t, 3);
+      The arguments of the functions made by `make_rollout`: the brush (b, 6 + 3 n), a row the
+      clamp point (3), segment length, EI / l0^3, compliance along the bristle, rest directions
+      (n, 3); friction; pivots and subdiagonal of the factor (n,); origin (t, 3);
       rotation (t, 3, 3); iterations.
     """
     n, b = config.segments, params.length.shape[0]
-    if b % LANES:
-        raise ValueError(f"{b} bristles: expected a multiple of {LANES}")
-    row = lambda x: np.asarray(x, np.float32)[None]  # noqa: E731
+    column = lambda x: np.asarray(x, np.float32)[:, None]  # noqa: E731
     brush = np.concatenate(
         [
-            np.asarray(params.root, np.float32),
-            row(params.segment_length(n)),
-            row(params.bending_stiffness(n)),
-            row(n / params.stretch_stiffness(n)),
-            np.asarray(params.rest, np.float32).reshape(3 * n, b),
-        ]
+            np.asarray(params.root, np.float32).T,
+            column(params.segment_length(n)),
+            column(params.bending_stiffness(n)),
+            column(n / params.stretch_stiffness(n)),
+            np.asarray(params.rest, np.float32).reshape(3 * n, b).T,
+        ],
+        axis=1,
     )
-    brush = np.ascontiguousarray(brush.reshape(-1, b // LANES, LANES).swapaxes(0, 1))
     difference = np.eye(n) - np.eye(n, k=-1)
     weight = np.append(2.0, np.ones(n - 1))
     factor = np.linalg.cholesky(difference.T @ (weight[:, None] * difference))
     single = lambda x: np.ascontiguousarray(np.asarray(x), np.float32)  # noqa: E731
     return (
-        brush,
+        single(brush),
         np.float32(params.friction),
         single(1.0 / np.diag(factor)),
         single(np.append(0.0, np.diag(factor, -1))),
@@ -60,205 +64,8 @@ def inputs(config, params, pose):
     )
 
 
-def joined(x):
-    """Blocks of lanes (g, t, ..., l) as one array over bristles (t, ..., b)."""
-    x = np.moveaxis(x, 0, -2)
-    return x.reshape(*x.shape[:-2], -1)
-
-
-# Counts of segments, contact nodes, tracked nodes and rows; `make_rollout` compiles with those of
-# a config.
-N, M, K, ROWS = 11, 1, 3, 0
-Z, ONE, TINY = np.float32(0.0), np.float32(1.0), np.float32(1e-12)
-
-
-def _stroke(brush, mu, pivot, sub, origin, rotation, iterations, position, force):
-    """One block of `LANES` bristles through all stamps.
-
-    Args:
-      brush to iterations: see `inputs`, for one block.
-      position: (t, k, 3, l) [mm] and force: (t, m, l) [µN], written.
-    """
-    memory = np.zeros((ROWS, LANES), np.float32)
-    e = memory[0 : 3 * N]
-    r = memory[3 * N : 6 * N]
-    d = memory[6 * N : 9 * N]
-    f = memory[9 * N : 12 * N]
-    w = memory[12 * N : 14 * N]
-    fold = memory[14 * N : 15 * N]
-    inside = memory[15 * N : 16 * N]
-    at = 16 * N
-    place = memory[at : at + 3 * K]
-    point = memory[at + 3 * K : at + 6 * K]
-    load = memory[at + 6 * K : at + 9 * K]
-    share = memory[at + 9 * K : at + 10 * K]
-    to = at + 10 * K
-    row = memory[to : to + 9]
-    total = memory[to + 9 : to + 18]
-    held = memory[to + 18 : to + 21]
-    kick = memory[to + 21 : to + 24]
-    off = memory[to + 24 : to + 27]
-    base = memory[to + 27 : to + 30]
-    worst = memory[to + 30 : to + 31]
-    own = memory[to + 31 : to + 37 + 3 * N]
-    for k in range(6 + 3 * N):
-        for q in range(LANES):
-            own[k, q] = brush[k, q]
-
-    for t in range(origin.shape[0]):
-        for k in range(3):
-            a, b, c, o = rotation[t, k, 0], rotation[t, k, 1], rotation[t, k, 2], origin[t, k]
-            for q in range(LANES):
-                base[k, q] = a * own[0, q] + b * own[1, q] + c * own[2, q] + o
-            for i in range(N):
-                s = 6 + 3 * i
-                for q in range(LANES):
-                    x = a * own[s, q] + b * own[s + 1, q] + c * own[s + 2, q]
-                    r[3 * i + k, q] = own[3, q] * x
-        if t == 0:
-            e[:] = r
-            _walk(e, base, place)
-            point[:] = place
-        for _ in range(iterations):
-            _walk(e, base, place)
-            _residual(e, r, d, f, load, own)
-            _choose(place, point, load, share, worst, held, off, inside)
-            _compliance(d, f, inside, pivot, sub, fold, row, total)
-            _coulomb(total, off, held, own, mu, kick)
-            for k in range(3):
-                for q in range(LANES):
-                    kick[k, q] -= held[k, q]
-                for c in range(M):
-                    for q in range(LANES):
-                        load[3 * c + k, q] += share[c, q] * kick[k, q]
-            _turn(e, d, f, w, inside, kick, pivot, sub, fold, row, own)
-        _walk(e, base, place)
-        # Friction holds the node at the end of the bristle's give.
-        point[:] = place
-        for c in range(M):
-            node = 3 * (K - M + c)
-            for k in range(2):
-                for q in range(LANES):
-                    point[node + k, q] += own[5, q] * load[3 * c + k, q]
-        for c in range(K):
-            for k in range(3):
-                for q in range(LANES):
-                    position[t, c, k, q] = place[3 * c + k, q]
-        for c in range(M):
-            for q in range(LANES):
-                force[t, c, q] = load[3 * c + 2, q]
-
-
-def _walk(e, base, place):
-    """Tracked nodes, down the segments from the clamp points."""
-    for k in range(3):
-        last = 3 * (K - 1) + k
-        for q in range(LANES):
-            x = Z
-            for i in range(N):
-                x += e[3 * i + k, q]
-            place[last, q] = base[k, q] + x
-        for c in range(1, K):
-            here = last - 3 * c
-            for q in range(LANES):
-                place[here, q] = place[here + 3, q] - e[3 * (N - c) + k, q]
-
-
-def _residual(e, r, d, f, load, own):
-    """Contact and bending force over stiffness on the segments, f [mm]; their directions, d."""
-    for k in range(3):
-        for q in range(LANES):
-            bent = e[k, q] - r[k, q]
-            f[k, q] = bent + bent
-        for i in range(1, N):
-            here = 3 * i + k
-            for q in range(LANES):
-                bent = e[here, q] - r[here, q] - e[here - 3, q] + r[here - 3, q]
-                f[here, q] = bent
-                f[here - 3, q] -= bent
-    for i in range(N):
-        for k in range(3):
-            here = 3 * i + k
-            for q in range(LANES):
-                x = Z
-                for c in range(max(M - N + i, 0), M):
-                    x += load[3 * c + k, q]
-                f[here, q] = x / own[4, q] - f[here, q]
-                d[here, q] = e[here, q] / own[3, q]
-
-
-def _choose(place, point, load, share, worst, held, off, inside):
-    """The contact that breaks its condition most: its force, place, and the segments above it."""
-    worst[:] = Z
-    held[:] = Z
-    off[:] = Z
-    for c in range(M):
-        node = 3 * (K - M + c)
-        for q in range(LANES):
-            gap = place[node + 2, q]
-            bad = abs(gap) if load[3 * c + 2, q] > Z else max(-gap, Z)
-            share[c, q] = bad + np.float32(1e-9) * np.float32(c)
-            worst[0, q] = max(worst[0, q], share[c, q])
-    for c in range(M):
-        node = 3 * (K - M + c)
-        for q in range(LANES):
-            g = ONE if share[c, q] >= worst[0, q] else Z
-            share[c, q] = g
-            held[0, q] += g * load[3 * c, q]
-            held[1, q] += g * load[3 * c + 1, q]
-            held[2, q] += g * load[3 * c + 2, q]
-            off[0, q] += g * (place[node, q] - point[node, q])
-            off[1, q] += g * (place[node + 1, q] - point[node + 1, q])
-            off[2, q] += g * place[node + 2, q]
-    for i in range(N):
-        for q in range(LANES):
-            g = Z
-            for c in range(max(M - N + i, 0), M):
-                g += share[c, q]
-            inside[i, q] = g
-
-
-def _compliance(d, f, inside, pivot, sub, fold, row, total):
-    """Whitened tangent components of the force, and of the contact's three directions.
-
-    A segment's tangents t_k, k in (x, y), have components delta_ka - fold d_k d_a along a in
-    (x, y) and d_k along z; fold: (n, l). row: (7, l), the segment before: five distinct columns
-    and the force, by forward substitution. total: (9, l), products summed over the segments: force
-    against the directions (3), directions among each other (6). f becomes its components (2).
-    """
-    total[:] = Z
-    row[:] = Z
-    for i in range(N):
-        p, s = pivot[i], sub[i]
-        for q in range(LANES):
-            x, y, z, g = d[3 * i, q], d[3 * i + 1, q], d[3 * i + 2, q], inside[i, q]
-            turn = ONE / max(ONE - z, np.float32(1e-3))
-            fold[i, q] = turn
-            mixed = f[3 * i + 2, q] - turn * (x * f[3 * i, q] + y * f[3 * i + 1, q])
-            u = f[3 * i, q] + x * mixed
-            v = f[3 * i + 1, q] + y * mixed
-            f[3 * i, q], f[3 * i + 1, q] = u, v
-            u = (u - s * row[5, q]) * p
-            v = (v - s * row[6, q]) * p
-            xx = ((ONE - turn * x * x) * g - s * row[0, q]) * p
-            xy = (-turn * x * y * g - s * row[1, q]) * p
-            yy = ((ONE - turn * y * y) * g - s * row[2, q]) * p
-            xz = (x * g - s * row[3, q]) * p
-            yz = (y * g - s * row[4, q]) * p
-            row[0, q], row[1, q], row[2, q] = xx, xy, yy
-            row[3, q], row[4, q], row[5, q], row[6, q] = xz, yz, u, v
-            total[0, q] += xx * u + xy * v
-            total[1, q] += xy * u + yy * v
-            total[2, q] += xz * u + yz * v
-            total[3, q] += xx * xx + xy * xy
-            total[4, q] += xx * xy + xy * yy
-            total[5, q] += xx * xz + xy * yz
-            total[6, q] += xy * xy + yy * yy
-            total[7, q] += xy * xz + yy * yz
-            total[8, q] += xz * xz + yz * yz
-
-
-def _newton(axx, axy, ayy, bx, by, shift, low, radius):
+@compiled(inline="always")
+def newton(axx, axy, ayy, bx, by, shift, low, radius):
     """The multiplier |u| / |F| of the slip after one step, see `jaxbrush.brush.contact`."""
     ax, ay = axx + shift, ayy + shift
     inv = ONE / (ax * ay + low)
@@ -270,112 +77,220 @@ def _newton(axx, axy, ayy, bx, by, shift, low, radius):
     return max(shift + step, Z)
 
 
-def _coulomb(total, off, held, own, mu, out):
-    """Contact with friction as `jaxbrush.brush.contact.coulomb`; out: (3, l) force [µN]."""
-    for q in range(LANES):
-        scale, soft, jam = ONE / own[4, q], own[5, q], np.float32(0.1)
-        xx, xy, xz = total[3, q] * scale, total[4, q] * scale, total[5, q] * scale
-        yy, yz, zz = total[6, q] * scale, total[7, q] * scale, total[8, q] * scale
-        fx, fy, fz = held[0, q], held[1, q], held[2, q]
-        sx = off[0, q] + total[0, q] - xx * fx - xy * fy - xz * fz
-        sy = off[1, q] + total[1, q] - xy * fx - yy * fy - yz * fz
-        sz = off[2, q] + total[2, q] - xz * fx - yz * fy - zz * fz
-        xx, yy, zz = xx + soft, yy + soft, zz + soft
-        inverse = ONE / zz
-        axx, axy, ayy = xx - xz * xz * inverse, xy - xz * yz * inverse, yy - yz * yz * inverse
-        bx, by = sx - xz * sz * inverse, sy - yz * sz * inverse
-        low = TINY * xx * yy
-        det = ONE / max(axx * ayy - axy * axy, low)
-        hx, hy = -(ayy * bx - axy * by) * det, -(axx * by - axy * bx) * det
-        hz = -(sz + xz * hx + yz * hy) * inverse
-        limit = mu * hz
-        stick = (hx * hx + hy * hy <= limit * limit) & (hz > Z)
-        drift = np.sqrt(bx * bx + by * by + TINY)
-        last = np.sqrt(fx * fx + fy * fy + TINY)
-        was = last > np.float32(1e-5)
-        tx = fx / last if was else -bx / drift
-        ty = fy / last if was else -by / drift
-        deep = max(-sz, Z)
-        radius = max(mu * deep / max(zz + mu * (xz * tx + yz * ty), jam * zz), np.float32(1e-6))
-        shift = max(drift / radius - (axx + ayy), Z)
-        low = low - axy * axy
-        shift = _newton(axx, axy, ayy, bx, by, shift, low, radius)
-        shift = _newton(axx, axy, ayy, bx, by, shift, low, radius)
-        shift = _newton(axx, axy, ayy, bx, by, shift, low, radius)
-        ax, ay = axx + shift, ayy + shift
-        inv = ONE / (ax * ay + low)
-        gx, gy = -(ay * bx - axy * by) * inv, -(ax * by - axy * bx) * inv
-        norm = np.sqrt(gx * gx + gy * gy + TINY)
-        tx, ty = gx / norm, gy / norm
-        z = deep / max(zz + mu * (xz * tx + yz * ty), jam * zz)
-        out[0, q] = (hx if stick else mu * z * tx) if sz < Z else Z
-        out[1, q] = (hy if stick else mu * z * ty) if sz < Z else Z
-        out[2, q] = (hz if stick else z) if sz < Z else Z
+@compiled(inline="always")
+def coulomb(xx, xy, xz, yy, yz, zz, sx, sy, sz, fx, fy, fz, soft, mu):
+    """Contact with friction as `jaxbrush.brush.contact.coulomb`, without branches.
+
+    Args:
+      xx to zz: compliance without the axial one, `soft` [mm/µN]. sx, sy, sz: where the tip goes
+        if its force stays fx, fy, fz [mm]. mu: friction.
+
+    Returns:
+      (x, y, z) force [µN].
+    """
+    sx -= xx * fx + xy * fy + xz * fz
+    sy -= xy * fx + yy * fy + yz * fz
+    sz -= xz * fx + yz * fy + zz * fz
+    xx, yy, zz = xx + soft, yy + soft, zz + soft
+    jam = np.float32(0.1) * zz
+    inverse = ONE / zz
+    axx, axy, ayy = xx - xz * xz * inverse, xy - xz * yz * inverse, yy - yz * yz * inverse
+    bx, by = sx - xz * sz * inverse, sy - yz * sz * inverse
+    low = TINY * xx * yy
+    det = ONE / max(axx * ayy - axy * axy, low)
+    hx, hy = -(ayy * bx - axy * by) * det, -(axx * by - axy * bx) * det
+    hz = -(sz + xz * hx + yz * hy) * inverse
+    limit = mu * hz
+    stick = (hx * hx + hy * hy <= limit * limit) & (hz > Z)
+    drift = np.sqrt(bx * bx + by * by + TINY)
+    last = np.sqrt(fx * fx + fy * fy + TINY)
+    was = last > np.float32(1e-5)
+    tx = fx / last if was else -bx / drift
+    ty = fy / last if was else -by / drift
+    deep = max(-sz, Z)
+    radius = max(mu * deep / max(zz + mu * (xz * tx + yz * ty), jam), np.float32(1e-6))
+    shift = max(drift / radius - (axx + ayy), Z)
+    low = low - axy * axy
+    shift = newton(axx, axy, ayy, bx, by, shift, low, radius)
+    shift = newton(axx, axy, ayy, bx, by, shift, low, radius)
+    shift = newton(axx, axy, ayy, bx, by, shift, low, radius)
+    ax, ay = axx + shift, ayy + shift
+    inv = ONE / (ax * ay + low)
+    gx, gy = -(ay * bx - axy * by) * inv, -(ax * by - axy * bx) * inv
+    norm = np.sqrt(gx * gx + gy * gy + TINY)
+    tx, ty = gx / norm, gy / norm
+    z = deep / max(zz + mu * (xz * tx + yz * ty), jam)
+    x = (hx if stick else mu * z * tx) if sz < Z else Z
+    y = (hy if stick else mu * z * ty) if sz < Z else Z
+    z = (hz if stick else z) if sz < Z else Z
+    return x, y, z
 
 
-def _turn(e, d, f, w, inside, kick, pivot, sub, fold, row, own):
-    """Segments turned by the inverse bending matrix times the tangent force, length kept."""
-    row[:] = Z
-    for i in range(N):
+@compiled()
+def _walk(e, base, place):
+    """Tracked nodes (k, 3), the last of them the tip, down the segments from the clamp point."""
+    n, tracked = e.shape[0], place.shape[0]
+    for k in range(3):
+        x = base[k]
+        for i in range(n):
+            x += e[i, k]
+            if i >= n - tracked:
+                place[i - n + tracked, k] = x
+
+
+@compiled()
+def _worst(place, load):
+    """The contact node that breaks its condition most, the tip on a draw; counts from 0."""
+    above = place.shape[0] - load.shape[0]
+    worst, most = 0, -ONE
+    for c in range(load.shape[0]):
+        gap = place[above + c, 2]
+        bad = abs(gap) if load[c, 2] > Z else max(-gap, Z)
+        if bad >= most:
+            worst, most = c, bad
+    return worst
+
+
+@compiled()
+def _residual(e, r, load, stiffness, f):
+    """Contact and bending force over stiffness on the segments, f (n, 3) [mm]."""
+    n, m = e.shape[0], load.shape[0]
+    for k in range(3):
+        pull = Z
+        for i in range(n - 1, -1, -1):
+            if i > n - 1 - m:
+                pull += load[i - n + m, k]
+            f[i, k] = pull / stiffness
+        before = -(e[0, k] - r[0, k])
+        for i in range(n):
+            bent = e[i, k] - r[i, k]
+            f[i, k] -= bent - before
+            if i > 0:
+                f[i - 1, k] += bent - before
+            before = bent
+
+
+@compiled()
+def _solve(e, f, reach, length, stiffness, soft, pivot, sub, mu, away, force, w, fold):
+    """The force on the contact below the first `reach` segments, and the segments turned by it.
+
+    A segment's tangents t_k, k in (x, y), have components delta_ka - fold d_k d_a along a in
+    (x, y) and d_k along z. Forward substitution whitens the force on them and the contact's
+    directions; products of both are the compliance.
+    """
+    n = e.shape[0]
+    xx = xy = xz = yy = yz = zz = mx = my = mz = Z
+    ax = ay = by = cx = cy = u = v = Z
+    for i in range(n):
+        x, y, z = e[i, 0] / length, e[i, 1] / length, e[i, 2] / length
+        turn = ONE / max(ONE - z, np.float32(1e-3))
+        fold[i] = turn
+        mixed = f[i, 2] - turn * (x * f[i, 0] + y * f[i, 1])
+        f[i, 0] += x * mixed
+        f[i, 1] += y * mixed
         p, s = pivot[i], sub[i]
-        for q in range(LANES):
-            x, y, g = d[3 * i, q], d[3 * i + 1, q], inside[i, q] / own[4, q]
-            mixed = kick[2, q] - fold[i, q] * (x * kick[0, q] + y * kick[1, q])
-            u = (f[3 * i, q] + g * (kick[0, q] + x * mixed) - s * row[0, q]) * p
-            v = (f[3 * i + 1, q] + g * (kick[1, q] + y * mixed) - s * row[1, q]) * p
-            row[0, q], row[1, q] = u, v
-            w[2 * i, q], w[2 * i + 1, q] = u, v
-    row[:] = Z
-    s = Z
-    for j in range(N):
-        i = N - 1 - j
-        p = pivot[i]
-        for q in range(LANES):
-            x, y = d[3 * i, q], d[3 * i + 1, q]
-            u = (w[2 * i, q] - s * row[0, q]) * p
-            v = (w[2 * i + 1, q] - s * row[1, q]) * p
-            row[0, q], row[1, q] = u, v
-            lift = x * u + y * v
-            ex = e[3 * i, q] + u - x * fold[i, q] * lift
-            ey = e[3 * i + 1, q] + v - y * fold[i, q] * lift
-            ez = e[3 * i + 2, q] + lift
-            scale = own[3, q] / np.sqrt(ex * ex + ey * ey + ez * ez + np.float32(1e-20))
-            e[3 * i, q], e[3 * i + 1, q], e[3 * i + 2, q] = ex * scale, ey * scale, ez * scale
+        g = ONE if i < reach else Z
+        u, v = (f[i, 0] - s * u) * p, (f[i, 1] - s * v) * p
+        ax, ay = ((ONE - turn * x * x) * g - s * ax) * p, (-turn * x * y * g - s * ay) * p
+        by = ((ONE - turn * y * y) * g - s * by) * p  # and bx is ay
+        cx, cy = (x * g - s * cx) * p, (y * g - s * cy) * p
+        mx, my, mz = mx + ax * u + ay * v, my + ay * u + by * v, mz + cx * u + cy * v
+        xx, xy, xz = xx + ax * ax + ay * ay, xy + ax * ay + ay * by, xz + ax * cx + ay * cy
+        yy, yz, zz = yy + ay * ay + by * by, yz + ay * cx + by * cy, zz + cx * cx + cy * cy
+
+    k = ONE / stiffness
+    fx, fy, fz = force
+    new = coulomb(
+        xx * k, xy * k, xz * k, yy * k, yz * k, zz * k,
+        away[0] + mx, away[1] + my, away[2] + mz, fx, fy, fz, soft, mu,
+    )  # fmt: skip
+    kx, ky, kz = (new[0] - fx) * k, (new[1] - fy) * k, (new[2] - fz) * k
+    u = v = Z
+    for i in range(n):
+        x, y = e[i, 0] / length, e[i, 1] / length
+        g = ONE if i < reach else Z
+        mixed = kz - fold[i] * (x * kx + y * ky)
+        u = (f[i, 0] + g * (kx + x * mixed) - sub[i] * u) * pivot[i]
+        v = (f[i, 1] + g * (ky + y * mixed) - sub[i] * v) * pivot[i]
+        w[i, 0], w[i, 1] = u, v
+    u = v = s = Z
+    for i in range(n - 1, -1, -1):
+        x, y = e[i, 0] / length, e[i, 1] / length
+        u, v = (w[i, 0] - s * u) * pivot[i], (w[i, 1] - s * v) * pivot[i]
         s = sub[i]
+        lift = x * u + y * v
+        ex, ey = e[i, 0] + u - x * fold[i] * lift, e[i, 1] + v - y * fold[i] * lift
+        ez = e[i, 2] + lift
+        scale = length / np.sqrt(ex * ex + ey * ey + ez * ez + np.float32(1e-20))
+        e[i, 0], e[i, 1], e[i, 2] = ex * scale, ey * scale, ez * scale
+    return new
+
+
+@compiled()
+def _stroke(own, mu, pivot, sub, origin, rotation, iterations, position, force):
+    """One bristle through all stamps; fills position (t, k, 3) [mm] and force (t, m) [µN]."""
+    n, tracked, m = pivot.shape[0], position.shape[1], force.shape[1]
+    above = tracked - m
+    length, stiffness, soft = own[3], own[4], own[5]
+    rest = own[6:].reshape(n, 3)
+    e, r = np.zeros((n, 3), np.float32), np.zeros((n, 3), np.float32)
+    f, w = np.zeros((n, 3), np.float32), np.zeros((n, 2), np.float32)
+    fold, base, away = np.zeros(n, np.float32), np.zeros(3, np.float32), np.zeros(3, np.float32)
+    load, point = np.zeros((m, 3), np.float32), np.zeros((m, 3), np.float32)
+    for t in range(origin.shape[0]):
+        place = position[t]
+        for k in range(3):
+            a, b, c = rotation[t, k, 0], rotation[t, k, 1], rotation[t, k, 2]
+            base[k] = a * own[0] + b * own[1] + c * own[2] + origin[t, k]
+            for i in range(n):
+                r[i, k] = length * (a * rest[i, 0] + b * rest[i, 1] + c * rest[i, 2])
+        if t == 0:
+            e[:] = r
+            _walk(e, base, place)
+            point[:] = place[above:]
+        for _ in range(iterations):
+            _walk(e, base, place)
+            c = _worst(place, load)
+            for k in range(3):
+                away[k] = place[above + c, k] - point[c, k]
+            away[2] = place[above + c, 2]
+            _residual(e, r, load, stiffness, f)
+            held = (load[c, 0], load[c, 1], load[c, 2])
+            reach = n - m + c + 1
+            load[c] = _solve(
+                e, f, reach, length, stiffness, soft, pivot, sub, mu, away, held, w, fold
+            )
+        _walk(e, base, place)
+        for c in range(m):
+            # Friction holds the node at the end of the bristle's give.
+            point[c, 0] = place[above + c, 0] + soft * load[c, 0]
+            point[c, 1] = place[above + c, 1] + soft * load[c, 1]
+            force[t, c] = load[c, 2]
 
 
 def make_rollout(config, parallel: bool = False):
-    """Compiles the loops for the counts of a BrushConfig.
-
-    Args:
-      config: counts of nodes. parallel: spreads the blocks of bristles over cores.
+    """Compiles the loops; `parallel` spreads the bristles over cores.
 
     Returns:
-      f(*inputs) -> position (g, t, k, 3, l) [mm] of the tracked nodes, force (g, t, m, l) [µN] of
-      the contact nodes, of g blocks of l lanes; None without numba.
+      f(*inputs) -> position (b, t, k, 3) [mm] of the tracked nodes, force (b, t, m) [µN] of the
+      contact nodes; None without numba.
     """
     if numba is None:
         return None
-    n, m = config.segments, config.contact_nodes
-    tracked = max(m, config.track_nodes)
-    scope = {
-        "np": np, "LANES": LANES, "N": n, "M": m, "K": tracked, "Z": Z, "ONE": ONE,
-        "TINY": TINY, "ROWS": 19 * n + 10 * tracked + 37,
-    }  # fmt: skip
-    fast = {"fastmath": True, "error_model": "numpy"}
-    # Inlined, so that the compiler knows where each row lies.
-    for part in (_newton, _walk, _residual, _choose, _compliance, _coulomb, _turn):
-        name = part.__name__
-        scope[name] = numba.njit(type(part)(part.__code__, scope, name), inline="always", **fast)
-    stroke = numba.njit(type(_stroke)(_stroke.__code__, scope, "stroke"), **fast)
+    tracked, m = config.tracked_nodes, config.contact_nodes
     span = numba.prange if parallel else range
 
     def rollout(brush, mu, pivot, sub, origin, rotation, iterations):
-        blocks, t = brush.shape[0], origin.shape[0]
-        position = np.empty((blocks, t, tracked, 3, LANES), np.float32)
-        force = np.empty((blocks, t, m, LANES), np.float32)
-        for g in span(blocks):
-            stroke(brush[g], mu, pivot, sub, origin, rotation, iterations, position[g], force[g])
+        bristles, t = brush.shape[0], origin.shape[0]
+        position = np.empty((bristles, t, tracked, 3), np.float32)
+        force = np.empty((bristles, t, m), np.float32)
+        for b in span(bristles):
+            _stroke(brush[b], mu, pivot, sub, origin, rotation, iterations, position[b], force[b])
         return position, force
 
-    return numba.njit(rollout, parallel=parallel, **fast)
+    return compiled(parallel=parallel)(rollout)
+
+
+def arranged(position, force):
+    """What a rollout returns in the order of a BristleTrack: (t, k, 3, b) and (t, m, b)."""
+    return np.moveaxis(position, 0, -1), np.moveaxis(force, 0, -1)
