@@ -11,6 +11,7 @@ of the same make is a yardstick.
 
 import dataclasses
 import functools
+import math
 import os
 import time
 from pathlib import Path
@@ -23,10 +24,10 @@ import tyro
 from matplotlib.ticker import LogLocator, NullFormatter
 from rich.progress import Progress
 
-from experiments import common, show_maps
+from experiments import common, map_cases
 from experiments.brush_costs import peak_flops, stream_bytes
 from experiments.common import COLORS, INK, Timing, console, print_table
-from experiments.show_maps import SIDE, between, draw, finer, roll
+from experiments.map_cases import SIDE, between, draw, finer, roll
 from jaxbrush.brush import BrushConfig, guides, make_brush, rollout
 from jaxbrush.raster import FORCE_UNIT, PIXEL, WIDTH, TrajectoryMaps, exact, trajectory_maps
 from jaxbrush.raster.sweeps import sweeps_of
@@ -59,7 +60,7 @@ class Config:
     quick: bool = False
     """Two strokes and one setting of a kind: the same code in about a minute."""
     strokes: tuple[str, ...] = STROKES
-    """Strokes of the comparison, from experiments.show_maps."""
+    """Strokes of the comparison, from experiments.map_cases."""
     bristles: int = 256
     """Bristles of the flat brush."""
     stamps: int = 200
@@ -179,19 +180,20 @@ def peer(case: dict):
 def parts(case: dict, params) -> dict:
     """Calls of the parts of the heaviest stroke's maps, each compiled on its own."""
     grid, track, radius = case["grid"], case["track"], 0.5 * WIDTH / PIXEL
-    first = jax.jit(lambda grid, track: (sweep(grid, track), exact.table_of(sweep(grid, track))))
-    latest = jax.jit(lambda s, t: exact.latest(s, t, grid.shape, radius))
-    passes = jax.jit(lambda s, t: exact.passes(s, t, grid.shape, radius))
-    values = jax.jit(lambda t, k: exact.values(t, k, radius))
+    stamps = track.time.shape[0]
+    first = jax.jit(lambda g, t: (sweep(g, t), exact.table_of(sweep(g, t), radius)))
+    latest = jax.jit(lambda t: exact.latest(t, stamps, grid.shape, radius))
+    passes = jax.jit(lambda t: exact.passes(t, stamps, grid.shape, radius))
+    values = jax.jit(lambda s, t, k: exact.values(s, t, k, radius))
     without = jax.jit(lambda g, t: dataclasses.replace(trajectory_maps(g, t), sweeps=None))
     sweeps, table = first(grid, track)
-    key = latest(sweeps, table)
+    key = latest(table)
     return {
         "bristles (rollout)": lambda: roll(BrushConfig(), params, case["stroke"]),
         "sweeps and their table": lambda: first(grid, track),
-        "keys of the latest sweep": lambda: latest(sweeps, table),
-        "passes (sweep count)": lambda: passes(sweeps, table),
-        "look-up of values": lambda: values(table, key),
+        "keys of the latest sweep": lambda: latest(table),
+        "passes (sweep count)": lambda: passes(table),
+        "look-up of values": lambda: values(sweeps, table, key),
         "all maps": lambda: draw(grid, track),
         "all maps but the sweep count": lambda: without(grid, track),
         "bristles and maps in one": lambda: paint(BrushConfig(), params, case["stroke"], grid),
@@ -201,16 +203,16 @@ def parts(case: dict, params) -> dict:
 def floor(case: dict) -> dict:
     """Least time of the exact maps of one stroke by arithmetic and by memory [s].
 
-    Operations a pixel of a window: nearest point 14, inside 1, key and maximum 2; passes have two
-    nearest points and 6 more; look-up 32 a pixel of the map. Bytes: windows read and written, a
-    row of 13 numbers each (two for passes); two tables; key, row and two values a pixel.
+    Operations a pixel of a window: place beside the sweep 8, inside 4, moment, key and maximum 11;
+    passes have two places and 6 more; look-up 25 a pixel of the map. Bytes: windows read and
+    written, 10 numbers each (two times for passes); a table; key, row and two values a pixel.
     """
     s = jax.tree.map(np.asarray, sweep(case["grid"], case["track"]))
     live, radius = s.depth > 0.0, 0.5 * WIDTH / PIXEL
     length = (np.hypot(s.ex, s.ey) * (s.high - s.low))[live]
-    windows, window, pixels = int(live.sum()), exact.window_side(radius) ** 2, SIDE * SIDE
-    flops = windows * window * (17 + 34) + pixels * 32
-    moved = 4 * (windows * (4 * window + 3 * 13) + 2 * 13 * live.size + pixels * (1 + 13 + 2))
+    windows, window, pixels = int(live.sum()), math.prod(exact.window_sides(radius)), SIDE * SIDE
+    flops = windows * window * (23 + 30) + pixels * 25
+    moved = 4 * (windows * (4 * window + 3 * 10) + 10 * live.size + pixels * (1 + 10 + 2))
     peak, stream = peak_flops(), stream_bytes()
     inside = float(np.sum(np.pi * radius**2 + 2.0 * radius * length)) / (windows * window)
     return {"sweeps_touching": windows, "share_inside": inside, "flops": flops, "bytes": moved,
@@ -238,9 +240,9 @@ def cases_of(options: Config, params, progress: Progress) -> list[dict]:
     config, found = BrushConfig(), []
     other = make_brush(jax.random.key(options.seed + 1), config, "flat", options.bristles)
     for name in progress.track(options.strokes, description="references"):
-        stroke = show_maps.stroke_of(name, options.stamps)
+        stroke = map_cases.stroke_of(name, options.stamps)
         track = roll(config, params, stroke)
-        grid = show_maps.square_grid(track, WIDTH)
+        grid = map_cases.square_grid(track, WIDTH)
         true, plain = layers(draw(finer(grid, FINE), track)), layers(draw(grid, track))
         step = np.linalg.norm(np.diff(np.asarray(track.position[:, -1, :2]), axis=0), axis=1)
         spacing = float(step[np.asarray(track.contact[1:, -1])].mean())
@@ -259,7 +261,7 @@ def work(setting: Setting, case: dict, params, options: Config):
     if setting.pixel != PIXEL:
         grid = finer(grid, PIXEL / setting.pixel)
     track = roll(config, params, stroke)
-    reach = 0.5 if setting.edge is None else show_maps.longest_of(track)
+    reach = 0.5 if setting.edge is None else map_cases.longest_of(track)
     maps = lambda: draw(grid, track, width=setting.width, edge=setting.edge, longest=reach)
     found = maps()
     if not bool(found.whole):

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxbrush.brush import BristleTrack
 from jaxbrush.raster import make_grid, trajectory_maps
+from jaxbrush.raster.exact import MOMENTS
 from jaxbrush.raster.sweeps import TIP_STIFFNESS
 
 PIXEL = 0.125
@@ -125,7 +126,8 @@ class Reference:
     bristle: that came last, -1 where none did. passes: how often one came. force [µN], when
     [s]: at which it left; fall, pace: their changes a pixel of its way. rim: whether the pixel is
     near the side of that sweep, where the way to its end is cut off. tie: several bristles at the
-    latest stamp. unsure: some sweep ends so close to the pixel that rounding may decide.
+    latest moment of the latest stamp; shared: at that stamp. unsure: some sweep ends so close to
+    the pixel, or leaves it so close to the turn of a moment, that rounding may decide.
     """
 
     bristle: np.ndarray
@@ -136,11 +138,23 @@ class Reference:
     pace: np.ndarray
     rim: np.ndarray
     tie: np.ndarray
+    shared: np.ndarray
     unsure: np.ndarray
 
 
-def reference(grid, track, width, tiny=2e-3) -> Reference:
-    """Loops over stamps, bristles (tips only) and pixels in float64: plain geometry."""
+def trailing_last(start, way, force):
+    """Bristles from the foremost to the last along their mean motion: starts and ways (2, b)."""
+    motion = way[:, force > 0].sum(axis=1)
+    return sorted(range(len(force)), key=lambda b: (-float(start[:, b] @ motion), b))
+
+
+def reference(grid, track, width, order="moment", tiny=2e-3) -> Reference:
+    """Loops over stamps, bristles (tips only) and pixels in float64: plain geometry.
+
+    order: of the bristles of a stamp over a pixel the latest is that which leaves it last, to a
+    "moment", and of those of one moment the last by number; or that of the last "number"; or the
+    one that is "trailing", as in soft maps.
+    """
     h, w = grid.shape
     ys, xs = np.mgrid[:h, :w].astype(float)
     tip = np.asarray(track.position, float)[:, -1]
@@ -153,12 +167,18 @@ def reference(grid, track, width, tiny=2e-3) -> Reference:
     number, boolean = lambda: np.zeros((h, w)), lambda: np.zeros((h, w), bool)  # noqa: E731
     out = Reference(
         bristle=np.full((h, w), -1), passes=np.zeros((h, w), int), force=number(), when=number(),
-        fall=number(), pace=number(), rim=boolean(), tie=boolean(), unsure=boolean(),
+        fall=number(), pace=number(), rim=boolean(), tie=boolean(), shared=boolean(),
+        unsure=boolean(),
     )  # fmt: skip
-    stamp_of, before = np.full((h, w), -1), np.zeros((bristles, h, w), bool)
+    stamp_of, moment_of = np.full((h, w), -1), np.full((h, w), -1)
+    before, turn = np.zeros((bristles, h, w), bool), boolean()
     for t in range(stamps):
-        for b in range(bristles):
-            s = max(t - 1, 0)
+        s = max(t - 1, 0)
+        pressed = np.maximum(depth[s], depth[t])
+        turns = range(bristles)
+        if order == "trailing":
+            turns = trailing_last(place[s], place[t] - place[s], pressed)
+        for b in turns:
             d0, d1 = depth[s, b], depth[t, b]
             if max(d0, d1) <= 0 or not bool(track.valid[t]):
                 before[b] = False
@@ -176,9 +196,16 @@ def reference(grid, track, width, tiny=2e-3) -> Reference:
             out.unsure |= np.abs(distance - radius) < tiny
             leave = np.minimum(u + np.sqrt(np.maximum(radius**2 - v**2, 0.0)), high * length)
             share = leave / length if length > 0 else high + 0.0 * u
+            moment = np.minimum(np.floor(MOMENTS * share), MOMENTS - 1)
+            # Near the turn of a moment, by how far rounding moves a bristle.
+            off = np.abs(MOMENTS * share - np.round(MOMENTS * share))
+            close = (off * length < MOMENTS * 1e-4) & (share < 1.0)
+            same = stamp_of == t
+            turn = np.where(covered, close | (turn & same), turn)
+            later = covered & (~same | (moment >= moment_of) | (order != "moment"))
             gain, span = force[t, b] - force[s, b], time[t] - time[s]
             for name, value in (
-                ("tie", stamp_of == t),
+                ("tie", same & (moment == moment_of)),
                 ("bristle", b),
                 ("force", force[s, b] + share * gain),
                 ("when", time[s] + share * span),
@@ -187,8 +214,11 @@ def reference(grid, track, width, tiny=2e-3) -> Reference:
                 ("rim", v**2 > 0.89 * radius**2),
             ):
                 field = getattr(out, name)
-                field[covered] = np.broadcast_to(value, (h, w))[covered]
-            stamp_of[covered] = t
+                field[later] = np.broadcast_to(value, (h, w))[later]
+            out.shared[covered] = same[covered]
+            stamp_of[covered], moment_of[later] = t, moment[later]
             out.passes += covered & ~before[b]
             before[b] = covered
+    if order == "moment":
+        out.unsure |= turn & out.shared
     return out

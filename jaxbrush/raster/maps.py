@@ -43,8 +43,10 @@ def trajectory_maps(
     """Draws the bristles of a track.
 
     Between two stamps a bristle sweeps a capsule of its width, from where it lands to where it
-    lifts. The value of a pixel is that of the latest sweep over its centre, at the moment it
-    leaves; sweeps of the same stamp are ordered by bristle.
+    lifts. The value of a pixel is that of the bristle that leaves its centre last, at that moment.
+    Exact maps tell moments of a 64th of the time between two stamps apart, and order the same
+    moment by bristle. Soft maps lay whole sweeps, those of a stamp from the foremost bristle to
+    the one that trails.
 
     Exact maps (`edge` None) are differentiable in forces, times and colors; which sweep is the
     latest, and coverage, have no slope. Soft maps are differentiable in positions too and tend to
@@ -58,16 +60,20 @@ def trajectory_maps(
       edge: width over which soft coverage falls from 1 to 0 [mm], static, or None for exact maps.
         The same width counts in height: a tip `edge` / 2 above the canvas begins to draw.
       nodes: how many nodes from the tip up draw; as many as the brush's contact nodes.
-      longest: step between stamps that soft maps must reach [mm], static; exact maps reach any.
+      longest: step between stamps, along x or y, that soft maps must reach [mm], static. Their
+        windows are that much wider than a bristle, so time and memory grow with its square; steps
+        beyond it leave gaps, and `whole` says so. Exact maps reach any.
 
     Returns:
       TrajectoryMaps in the float type of the track.
 
     Raises:
-      ValueError: widths that are not positive, `nodes` or `color` that do not fit the track, more
-        sweeps than keys.
+      ValueError: a track without stamps, widths that are not positive, `nodes` or `color` that do
+        not fit the track, more sweeps than keys.
     """
     stamps, _, _, b = track.position.shape
+    if stamps < 1:
+        raise ValueError(f"a track of {stamps} stamps: expected at least 1")
     if not width > 0.0:
         raise ValueError(f"width = {width!r}: expected a positive width [mm]")
     if edge is not None and not 0.0 < edge <= 20.0 * width:
@@ -86,16 +92,16 @@ def trajectory_maps(
 
     radius = 0.5 * width / grid.pixel
     sweeps = sweeps_of(grid, track, nodes, 0.0)
-    table = exact.table_of(sweeps)
-    still = jax.lax.stop_gradient((sweeps, table))
-    key = exact.latest(*still, grid.shape, radius)
-    force, time = exact.values(table, key, radius)
+    table = exact.table_of(sweeps, radius)
+    still = jax.lax.stop_gradient(table)
+    key = exact.latest(still, stamps, grid.shape, radius)
+    force, time = exact.values(sweeps, table, key, radius)
     covered = key > 0
-    bristle = jnp.maximum(key - 1, 0) % (b * nodes)
+    _, bristle = exact.decode(key, b * nodes)
     dtype = force.dtype
     return TrajectoryMaps(
         pressure=force / FORCE_UNIT,
-        sweeps=exact.passes(*still, grid.shape, radius).astype(dtype),
+        sweeps=exact.passes(still, stamps, grid.shape, radius).astype(dtype),
         color=jnp.where(covered[..., None], color[bristle], 0.0),
         time=time,
         coverage=covered.astype(dtype),

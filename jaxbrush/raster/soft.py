@@ -1,9 +1,10 @@
 """Soft trajectory maps: coverage with an edge of finite width, composited in time order.
 
 A bristle covers a pixel to the degree a, 1 inside, falling to 0 over the edge. Sweeps are laid
-over each other in time order, and consecutive sweeps of one bristle count as one touch: a sweep
-replaces what the same bristle left at the stamp before, so the result does not depend on how
-finely the stroke is sampled. With layers P (coverage, and values times coverage) that is
+over each other in time order, those of a stamp by `in_stamp`, and consecutive sweeps of one
+bristle count as one touch: a sweep replaces what the same bristle left at the stamp before, so the
+result does not depend on how finely the stroke is sampled. With layers P (coverage, and values
+times coverage) that is
 
   P <- keep P + add,  keep = (1 - a) / max(1 - min(a, a_before), SLACK),
                       add = a v + (1 - keep - a) v_before
@@ -73,22 +74,33 @@ def _windows(sweeps, earlier, y, x, side, radius, edge, height):
     return keep, jnp.stack([now + then, force, time], axis=1), jnp.maximum(a - old, 0.0)
 
 
+def in_stamp(sweeps: Sweeps):
+    """Numbers of the bristles of each stamp in the order that they pass a place in, (t, b): from
+    the foremost along the mean motion of those that touch to the one that trails; by number
+    where they are level or at rest."""
+    touch = sweeps.depth > 0.0
+    total = lambda x: jnp.sum(jnp.where(touch, x, 0.0), axis=1, keepdims=True)  # noqa: E731
+    ahead = sweeps.x * total(sweeps.ex) + sweeps.y * total(sweeps.ey)
+    return jnp.argsort(jax.lax.stop_gradient(-ahead), axis=1, stable=True)
+
+
 @jax.custom_vjp
-def composite(image, keep, add, color, corner):
+def composite(image, keep, add, color, corner, order):
     """Lays windows over an image, one after the other: inside each, image * keep + add.
 
     Args:
       image: (6, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 3, s, s) to
         coverage, force and time. color: (n, 3), which comes with coverage. corner: (n, 2) int y, x.
+        order: (n,) int, the number of the first window, of the next, ...
 
     Returns:
       (6, h, w).
     """
-    return _composite_forward(image, keep, add, color, corner)[0]
+    return _composite_forward(image, keep, add, color, corner, order)[0]
 
 
-def _run(image, corner, side, change, backwards=False):
-    """Applies `change(i, window)` to each window of an image in turn.
+def _run(image, corner, order, side, change, backwards=False):
+    """Applies `change(i, window)` to each window i of an image, in order.
 
     Returns:
       (image, (n, c, s, s) the windows as they were before their change).
@@ -101,35 +113,37 @@ def _run(image, corner, side, change, backwards=False):
 
     def step(k, carry):
         image, seen = carry
-        i = count - 1 - k if backwards else k
+        i = order[count - 1 - k if backwards else k]
         start = (jnp.zeros((), corner.dtype), corner[i, 0], corner[i, 1])
+        place = (i, *3 * (jnp.zeros((), i.dtype),))
         old = jax.lax.dynamic_slice(image, start, size)
-        seen = jax.lax.dynamic_update_slice(seen, old[None], (i, 0, 0, 0))
-        old = jax.lax.dynamic_slice(seen, (i, 0, 0, 0), (1, *size))[0]
+        seen = jax.lax.dynamic_update_slice(seen, old[None], place)
+        old = jax.lax.dynamic_slice(seen, place, (1, *size))[0]
         return jax.lax.dynamic_update_slice(image, change(i, old), start), seen
 
     seen = jnp.zeros((count, *size), image.dtype)
     return jax.lax.fori_loop(0, count, step, (image, seen))
 
 
-def _composite_forward(image, keep, add, color, corner):
+def _composite_forward(image, keep, add, color, corner, order):
     def change(i, old):
         paint = color[i][:, None, None] * add[i, :1]
         return old * keep[i][None] + jnp.concatenate([add[i], paint])
 
-    image, old = _run(image, corner, keep.shape[-1], change)
-    return image, (keep, add, color, old, corner)
+    image, old = _run(image, corner, order, keep.shape[-1], change)
+    return image, (keep, add, color, old, corner, order)
 
 
 def _composite_backward(saved, slope):
-    keep, add, color, old, corner = saved
+    keep, add, color, old, corner, order = saved
     change = lambda i, slope: slope * keep[i][None]  # noqa: E731
-    slope, by = _run(slope, corner, keep.shape[-1], change, backwards=True)
+    slope, by = _run(slope, corner, order, keep.shape[-1], change, backwards=True)
     by_keep = jnp.sum(by * old, axis=1)
     by_color = jnp.einsum("ncyx,nyx->nc", by[:, 3:], add[:, 0], precision="highest")
     by_paint = jnp.einsum("ncyx,nc->nyx", by[:, 3:], color, precision="highest")
     by_add = jnp.concatenate([by[:, :1] + by_paint[:, None], by[:, 1:3]], axis=1)
-    return slope, by_keep, by_add, by_color, np.zeros(corner.shape, jax.dtypes.float0)
+    none = (np.zeros(number.shape, jax.dtypes.float0) for number in (corner, order))
+    return slope, by_keep, by_add, by_color, *none
 
 
 composite.defvjp(_composite_forward, _composite_backward)
@@ -169,7 +183,8 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
     colors = flat(jnp.broadcast_to(color[None], (stamps, count, 3)))
     corner = flat(jnp.stack([y, x], axis=-1)) + side
     padded = (shape[0] + 2 * side, shape[1] + 2 * side)
-    layers = composite(jnp.zeros((6, *padded), keep.dtype), keep, add, colors, corner)
+    order = (in_stamp(sweeps) + count * jnp.arange(stamps)[:, None]).reshape(-1)
+    layers = composite(jnp.zeros((6, *padded), keep.dtype), keep, add, colors, corner, order)
     numbers = jax.lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )

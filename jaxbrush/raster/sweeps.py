@@ -15,7 +15,7 @@ TIP_STIFFNESS = 37.0
 POINT = 0.02
 """Sweeps much shorter than this [pixels] count as points."""
 FAR = 1e6
-"""Where sweeps that touch nothing are put [pixels]."""
+"""Where sweeps that touch nothing are put [pixels], and more than any measure of one that does."""
 
 
 @state
@@ -73,13 +73,14 @@ def sweeps_of(grid, track, nodes: int, threshold: float) -> Sweeps:
     origin = grid.origin.astype(track.position.dtype)
     x = (flat(track.position[:, :, 0]) - origin[0]) / grid.pixel - 0.5
     y = (flat(track.position[:, :, 1]) - origin[1]) / grid.pixel - 0.5
-    force = flat(track.force)
-    pressed = (force > 0.0) & track.valid[:, None]
-    force = jnp.where(pressed, force, 0.0)
-    above = jnp.maximum(jnp.abs(flat(track.position[:, :, 2])), 1e-6)
-    # Padding is far above the canvas.
-    above = jnp.where(track.valid[:, None], above, FAR)
-    end = jnp.where(pressed, force / TIP_STIFFNESS, -above)
+    z, force = flat(track.position[:, :, 2]), flat(track.force)
+    # Padding, and what is not finite or past all canvases, is far above this one.
+    known = (jnp.abs(x) < FAR) & (jnp.abs(y) < FAR) & (jnp.abs(z) < FAR) & (jnp.abs(force) < FAR)
+    known &= track.valid[:, None]
+    x, y, z, force = (jnp.where(known, v, 0.0) for v in (x, y, z, force))
+    force = jnp.where(force > 0.0, force, 0.0)
+    above = jnp.where(known, jnp.maximum(jnp.abs(z), 1e-6), FAR)
+    end = jnp.where(force > 0.0, force / TIP_STIFFNESS, -above)
     time = jnp.broadcast_to(stroke_time(track)[:, None].astype(x.dtype), x.shape)
 
     start = _start(end)
@@ -102,7 +103,7 @@ def sweeps_of(grid, track, nodes: int, threshold: float) -> Sweeps:
         gain=force - _start(force),
         time=_start(time),
         span=time - _start(time),
-        depth=jnp.where(track.valid[:, None], jnp.maximum(start, end), -FAR),
+        depth=jnp.where(known & _start(known), jnp.maximum(start, end), -FAR),
     )
 
 
