@@ -147,16 +147,17 @@ def film(show: Show, total: int, path: Path, size: float = 4.2, dots: int = 84):
     partial.replace(path)
 
 
-def chart(rows, levels, bar: float, path: Path):
-    """Path error [mm] of every stroke against step, the levels marked by their pixel."""
+def chart(rows, opening: int, levels, bar: float, path: Path):
+    """Path error [mm] of every stroke against step: the opening, the levels by their pixel."""
     curves = {row["stroke"]: row["path_by_step"] for row in rows}
-    ends = np.cumsum([level.steps for level in levels])
+    ends = np.cumsum([opening, *(level.steps for level in levels)])
+    names = ["opening", *(f"{level.pixel:g} mm" for level in levels)]
     figure, axis = plt.subplots(figsize=(7.6, 4.3))
     start = 0
-    for index, (end, level) in enumerate(zip(ends, levels, strict=True)):
+    for index, (end, name) in enumerate(zip(ends, names, strict=True)):
         if index % 2:
             axis.axvspan(start, end, color="#f4efe6", lw=0, zorder=0)
-        axis.text(0.5 * (start + end), 1.01, f"{level.pixel:g} mm", ha="center", va="bottom",
+        axis.text(0.5 * (start + end), 1.01, name, ha="center", va="bottom",
                   fontsize=8, color=INK, transform=axis.get_xaxis_transform())  # fmt: skip
         start = end
     for index, (name, curve) in enumerate(curves.items()):
@@ -172,15 +173,17 @@ def report(rows, pixel: float, title: str):
     """Prints the table of all strokes."""
     print_table(
         title,
-        ["stroke", "start [mm]", "end [mm]", "end [pixels]", "largest [mm]", "pressure from",
-         "to, rms", "seconds", "gaps"],
+        ["stroke", "start [mm]", "opened", "end [mm]", "end [pixels]", "largest [mm]",
+         "firm [mm]", "pressure from", "to, rms", "seconds", "gaps"],
         [
             [
                 r["stroke"],
                 f"{r['start']['path']:.2f}",
+                f"{r['opened']['path']:.2f}",
                 f"{r['end']['path']:.4f}",
                 f"{r['end']['path'] / pixel:.2f}",
                 f"{r['end']['most']:.3f}",
+                f"{r['end']['firm']:.4f}",
                 f"{r['start']['press']:.3f}",
                 f"{r['end']['press']:.4f}",
                 f"{r['seconds']:.0f}",

@@ -1,9 +1,11 @@
 """Reads a stroke out of its maps: the path and pressure of the hand, by gradient descent.
 
-Known are the brush, the tilt and the times of the stamps; the maps are the exact ones, the fit
-draws soft ones. It starts with the true path shifted and bent by 3 mm, and one pressure for all.
+Known are the brush, the tilt and the times of the stamps. The fit starts with the true path
+shifted and bent by 3 mm, and one pressure for all; moves to where the maps say the brush was; and
+descends by Adam through soft maps and bristles. The maps that it reads are exact, of a brush that
+is solved as in the fit and drawn at twice as many stamps.
 
-python -m experiments.fit_stroke            # six strokes, about 10 minutes on one core
+python -m experiments.fit_stroke            # six strokes, about 8 minutes on one core
 python -m experiments.fit_stroke --quick    # one of them; most of its time is the compiler's
 """
 
@@ -24,35 +26,32 @@ from rich.progress import Progress
 from experiments.common import console, results_folder, write_run
 from experiments.fit_drawing import Show, chart, film, report, strip
 from experiments.fit_loss import PIXEL, Level, compare, target_of
+from experiments.fit_opening import basis, moved
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
 from jaxbrush.raster import Grid, TrajectoryMaps, trajectory_maps
 from jaxbrush.structs import config, state
 from jaxbrush.stylus import KINDS, Stroke, random_stroke
 
-SIDE = 51.2
+SIDE = 38.4
 """Side of the canvas around a stroke [mm]."""
 SCALES = (6, 12, 24, 48)
 """Control points of the cubic B-splines whose sum is a curve: Adam moves the whole stroke by the
 first and bends it by the last."""
-PRESSED = 0.1
-"""A pen pressed less leaves next to nothing in the maps; its path is not asked for."""
 BAR = 0.5 * PIXEL
 """Success: rms path error below half a pixel [mm]."""
 FOUND = ("s_curve", "arc", "scribble", "hook", "straight", "arc")
 """Kinds of the strokes, in turn; dabs are shorter than the way to go."""
-EVEN = (0.5, 0.5, 0.5, 0.5), (1, 1, 1, 1)
-# fmt: off
+OPENING = 8
+"""Steps of the opening."""
 LEVELS = (
-    Level(0.8, 0.8, 1.6, (0.5, 1), (0, 1), 80, (0.3, 0.1), (1, 0.5, 0, 0), (0.5, 0.3, 0, 0)),
-    Level(0.8, 0.8, 1.0, (1, 3), (0.5, 1), 60, (0.1, 0.06), (0.7, 0.7, 0.5, 0), (1, 0.7, 0, 0)),
-    Level(0.8, 0.8, 0.5, (1, 4), (1, 0.2), 60, (0.06, 0.03), (.7, .7, .5, .2), (1, .7, .3, 0)),
-    Level(0.4, 0.4, 0.0, (2, 6), (1, 0.05), 80, (0.04, 0.01), (.5, .5, .5, .3), (1, 1, .5, .2)),
-    Level(0.2, 0.2, 0.0, (2, 8), (1, 0), 70, (0.015, 0.003), *EVEN),
-    Level(0.1, 0.1, 0.0, (2, 8), (1, 0), 40, (0.004, 0.0005), *EVEN),
+    Level(0.8, (1, 3), 80, (0.05, 0.02), (1, 1, 0.7, 0)),
+    Level(0.4, (2, 6), 60, (0.03, 0.01), (1, 1, 0.7, 0.2)),
+    Level(0.2, (2, 8), 40, (0.012, 0.002), (0.5, 0.5, 0.5, 0.5)),
 )
-# fmt: on
-"""Coarse to fine. First where the brush was in each part of the stroke's time, which a stroke far
-away feels too; then the images."""
+"""Coarse to fine."""
+WEAK = 1e-3
+"""Slope [1/mm] of the loss below which Adam's steps shrink: where a brush hardly touches, it would
+else go as far along the noise as it goes elsewhere along the slope."""
 PRIOR = 1e-10
 """Weight of the squared jerk [mm per stroke time^3] of the path where the pen barely presses: it
 leaves no trace there, and goes on as it came."""
@@ -71,17 +70,9 @@ class Unknown:
 class Setting:
     """What a fit compiles for. longest: step of a tip that soft maps reach [mm]."""
 
-    brush: BrushConfig = BrushConfig()
+    brush: BrushConfig = BrushConfig(stride=1)
     scales: tuple[int, ...] = SCALES
     longest: float = 1.0
-
-
-def basis(stamps: int, count: int) -> np.ndarray:
-    """Cubic B-splines with evenly spaced knots, (stamps, count); rows sum to 1."""
-    at = np.linspace(0.0, count - 3.0, stamps)[:, None] - np.arange(-1, count - 1)[None]
-    far = np.abs(at)
-    near = 2.0 / 3.0 - far**2 + 0.5 * far**3
-    return np.where(far < 1.0, near, np.clip(2.0 - far, 0.0, None) ** 3 / 6.0)
 
 
 def _curve(points, stamps: int):
@@ -92,39 +83,41 @@ def _curve(points, stamps: int):
     return total
 
 
-def stroke_of(unknown: Unknown, known: Stroke) -> Stroke:
-    """The stroke of an unknown; its timing, tilt and twist are those of `known`."""
-    stamps = known.time.shape[0]
+def with_curve(known: Stroke, path, press) -> Stroke:
+    """A stroke of path (t, 2) [mm] and pressure given by its logit (t,); its timing, tilt and
+    twist are those of `known`."""
     return dataclasses.replace(
-        known,
-        position=_curve(unknown.path, stamps),
-        pressure=jax.nn.sigmoid(_curve(unknown.press, stamps)),
+        known, position=jnp.asarray(path, float), pressure=jax.nn.sigmoid(jnp.asarray(press, float))
     )
 
 
-def start_at(position, pressure: float, scales) -> Unknown:
-    """An unknown whose path is `position` (t, 2) and whose pressure is constant."""
-    left, path = np.asarray(position, float), []
+def stroke_of(unknown: Unknown, known: Stroke) -> Stroke:
+    """The stroke of an unknown."""
+    stamps = known.time.shape[0]
+    return with_curve(known, _curve(unknown.path, stamps), _curve(unknown.press, stamps))
+
+
+def unknown_of(curve: np.ndarray, scales) -> Unknown:
+    """The control points of a curve (t, 3) of x, y and logit of the pressure: by the first scale
+    what it can, by the next what is left."""
+    points = []
     for k in scales:
-        b = basis(len(left), k)
+        b = basis(len(curve), k)
         # A little ridge keeps the points tame where splines are short of stamps.
-        points = np.linalg.solve(b.T @ b + 1e-3 * np.eye(k), b.T @ left)
-        left = left - b @ points
-        path.append(jnp.asarray(points, float))
-    level = float(np.log(pressure / (1.0 - pressure)))
-    press = [jnp.full(k, level if i == 0 else 0.0) for i, k in enumerate(scales)]
-    return Unknown(path=tuple(path), press=tuple(press))
+        found = np.linalg.solve(b.T @ b + 1e-3 * np.eye(k), b.T @ curve)
+        curve = curve - b @ found
+        points.append(jnp.asarray(found, float))
+    return Unknown(path=tuple(x[:, :2] for x in points), press=tuple(x[:, 2] for x in points))
 
 
 def astray(key, stroke: Stroke, distance: float):
-    """The path of a stroke shifted and bent until it is `distance` off (rms) where it presses."""
+    """The path of a stroke shifted and bent until it is `distance` off (rms)."""
     turn, bend = jax.random.split(key)
     angle = jax.random.uniform(turn, maxval=2 * np.pi)
     shift = np.array([np.cos(angle), np.sin(angle)])
     wobble = basis(len(stroke.time), 7) @ np.asarray(jax.random.normal(bend, (7, 2)))
     offset = shift + 0.7 * wobble
-    pressed = np.asarray(stroke.pressure) > PRESSED
-    rms = np.sqrt(np.mean(np.sum(offset**2, axis=1)[pressed]))
+    rms = np.sqrt(np.mean(np.sum(offset**2, axis=1)))
     return np.asarray(stroke.position) + distance / rms * offset
 
 
@@ -149,22 +142,22 @@ def rates(levels):
 
 
 def make_tools(setting: Setting, levels) -> Tools:
-    """Compiled functions of a fit: (unknown, known, brush) to track, its slope, one update."""
-    optimizer = optax.chain(optax.zero_nans(), optax.adam(rates(levels), b1=0.8, b2=0.95))
+    """Compiled functions of a fit: stroke to track, slope of the loss of a track, one update."""
+    optimizer = optax.chain(optax.zero_nans(), optax.adam(rates(levels), b1=0.8, b2=0.95, eps=WEAK))
 
-    def draw(unknown, known, brush):
-        return rollout(setting.brush, brush, stroke_of(unknown, known))
+    def draw(stroke, brush):
+        return rollout(setting.brush, brush, stroke)
 
-    def slope(pixel, edge, origin, target, track):
+    def slope(pixel, origin, target, track):
         def loss(position, force):
             drawn = dataclasses.replace(track, position=position, force=force)
-            return compare(pixel, edge, setting.longest, origin, target, drawn)
+            return compare(pixel, setting.longest, origin, target, drawn)
 
         return jax.value_and_grad(loss, (0, 1), has_aux=True)(track.position, track.force)
 
     def move(unknown, memory, known, brush, slope, share):
         def drawn(unknown):
-            track = draw(unknown, known, brush)
+            track = draw(stroke_of(unknown, known), brush)
             return (track.position, track.force), prior(unknown, known)
 
         _, back = jax.vjp(drawn, unknown)
@@ -175,42 +168,68 @@ def make_tools(setting: Setting, levels) -> Tools:
         step = jax.tree.map(jnp.multiply, step, share)
         return optax.apply_updates(unknown, step), memory, gradient
 
-    return Tools(jax.jit(draw), jax.jit(slope, static_argnums=(0, 1)), jax.jit(move), optimizer)
+    return Tools(jax.jit(draw), jax.jit(slope, static_argnums=0), jax.jit(move), optimizer)
 
 
-def fit(tools: Tools, levels, case: "Case", watch=lambda *_: None) -> Unknown:
-    """Descends from the start through the levels; `watch(unknown, loss, whole)` sees every step."""
-    unknown, memory = case.start, tools.optimizer.init(case.start)
+_shape = jax.jit(stroke_of)
+
+
+def fit(setting: Setting, tools: Tools, levels, case: "Case", watch=lambda *_: None) -> Stroke:
+    """Opens from the start of a case, then descends through the levels.
+
+    Args:
+      watch: called with (stroke, loss, whole) at every step; the opening's loss is None.
+
+    Returns:
+      The stroke that was found.
+    """
     known, brush, origin = case.true, case.brush, case.origin
+    curve = np.asarray(case.start, float)
+    for _ in range(OPENING):
+        stroke = with_curve(known, curve[:, :2], curve[:, 2])
+        watch(stroke, None, True)
+        curve = moved(curve, exact_maps(origin, tools.draw(stroke, brush)), case.exact)
+    unknown = unknown_of(curve, setting.scales)
+    memory = tools.optimizer.init(unknown)
     for level in levels:
         target = target_of(level, case.exact)
-        share = jax.tree.map(jnp.float32, Unknown(path=level.path, press=level.press))
+        share = jax.tree.map(jnp.float32, Unknown(path=level.shares, press=level.shares))
         for _ in range(level.steps):
-            drawn = tools.draw(unknown, known, brush)
-            (loss, whole), slope = tools.slope(level.pixel, level.edge, origin, target, drawn)
-            watch(unknown, loss, whole)
+            stroke = _shape(unknown, known)
+            track = tools.draw(stroke, brush)
+            (loss, whole), slope = tools.slope(level.pixel, origin, target, track)
+            watch(stroke, loss, whole)
             unknown, memory, _ = tools.move(unknown, memory, known, brush, slope, share)
-    return unknown
+    return _shape(unknown, known)
 
 
-def errors(found: Stroke, true: Stroke) -> dict:
-    """Path error rms and largest [mm] and pressure error rms, where the true pen presses."""
-    pressed = np.asarray(true.pressure) > PRESSED
-    off = np.linalg.norm(np.asarray(found.position) - np.asarray(true.position), axis=1)[pressed]
-    press = (np.asarray(found.pressure) - np.asarray(true.pressure))[pressed]
+def errors(found: Stroke, case: "Case") -> dict:
+    """Path error rms and largest [mm] and pressure error rms, over the stamps at which the true
+    brush touches (where no bristle does, the maps say nothing); firm: path error rms where the
+    pen is pressed beyond 0.1."""
+    off = np.linalg.norm(np.asarray(found.position) - np.asarray(case.true.position), axis=1)
+    press = np.asarray(found.pressure) - np.asarray(case.true.pressure)
+    firm = np.asarray(case.true.pressure) > 0.1
     rms = lambda x: float(np.sqrt(np.mean(x**2)))  # noqa: E731
-    return {"path": rms(off), "most": float(off.max()), "press": rms(press)}
+    return {
+        "path": rms(off[case.touching]),
+        "most": float(off[case.touching].max()),
+        "press": rms(press[case.touching]),
+        "firm": rms(off[firm]),
+    }
 
 
-@state
+@dataclasses.dataclass(frozen=True)
 class Case:
-    """A stroke to find: its brush, the truth, its exact maps and where they lie, a start."""
+    """A stroke to find: its brush, the truth, when it touches (t,), its exact maps and where they
+    lie, a start (t, 3): x, y [mm] and logit of the pressure."""
 
     brush: BrushParams
     true: Stroke
+    touching: np.ndarray
     exact: TrajectoryMaps
     origin: jax.Array
-    start: Unknown
+    start: np.ndarray
 
 
 @jax.jit
@@ -225,21 +244,30 @@ _invented = jax.jit(random_stroke, static_argnums=(1, 3))
 
 
 def make_case(setting: Setting, options: "Config", seed: int) -> Case:
-    """Draws stroke number `seed`; the truth moves in steps half as long as the fit's."""
+    """Draws stroke number `seed`, at twice the stamps of the fit, of which the brush is solved at
+    every second: solved at others, it would trail up to 0.1 mm elsewhere."""
     key = jax.random.fold_in(jax.random.key(options.seed), seed)
     kind = KINDS.index(FOUND[seed % len(FOUND)])
     hand, hair, away = jax.random.split(key, 3)
     brush = make_brush(hair, setting.brush, options.shape, options.bristles)
     fine = _invented(hand, 2 * options.stamps - 1, options.extent, kind)
-    track = _brushed(setting.brush, brush, fine)
-    place = np.moveaxis(np.asarray(track.position)[:, -1, :2], 1, 2)
-    place = place[np.asarray(track.contact)[:, -1]]
+    twice = dataclasses.replace(setting.brush, stride=2 * setting.brush.solve_stride)
+    track = _brushed(twice, brush, fine)
+    contact = np.asarray(track.contact)[:, -1]
+    place = np.moveaxis(np.asarray(track.position)[:, -1, :2], 1, 2)[contact]
     corner = 0.5 * (place.min(0) + place.max(0)) - 0.5 * SIDE
     origin = jnp.asarray(np.round(corner / PIXEL) * PIXEL, float)
-    exact = exact_maps(origin, track)
     true = jax.tree.map(lambda x: x[::2], fine)
-    start = start_at(astray(away, true, options.distance), options.pressure, setting.scales)
-    return Case(brush=brush, true=true, exact=exact, origin=origin, start=start)
+    press = np.full(options.stamps, np.log(options.pressure / (1.0 - options.pressure)))
+    path = astray(away, true, options.distance)
+    return Case(
+        brush=brush,
+        true=true,
+        touching=contact[::2].any(1),
+        exact=exact_maps(origin, track),
+        origin=origin,
+        start=np.concatenate([path, press[:, None]], axis=1),
+    )
 
 
 @dataclasses.dataclass(frozen=True)
@@ -268,25 +296,25 @@ class Config:
     """Seed of strokes, brushes and starts."""
 
 
-def run(tools: Tools, case: Case, tick=lambda: None):
-    """Fits one case; returns the row of numbers and the curves of every step."""
+def run(setting: Setting, tools: Tools, case: Case, tick=lambda: None):
+    """Fits one case; returns the row of numbers and the stroke at every step."""
     seen, losses, holes = [], [], 0
 
-    def watch(unknown, loss, whole):
+    def watch(stroke, loss, whole):
         nonlocal holes
-        seen.append(unknown)
-        losses.append(float(loss))
+        seen.append(stroke)
+        if loss is not None:
+            losses.append(float(loss))
         holes += not whole
         tick()
 
     start = time.perf_counter()
-    unknown = fit(tools, LEVELS, case, watch)
+    seen.append(fit(setting, tools, LEVELS, case, watch))
     seconds = time.perf_counter() - start
-    curves = [stroke_of(u, case.true) for u in [*seen, unknown]]
-    steps = [errors(curve, case.true) for curve in curves]
-    row = {"start": steps[0], "end": steps[-1], "seconds": seconds, "holes": holes}
-    row |= {"path_by_step": [e["path"] for e in steps], "loss": losses}
-    return row, curves
+    steps = [errors(stroke, case) for stroke in seen]
+    row = {"start": steps[0], "opened": steps[OPENING], "end": steps[-1]}
+    row |= {"seconds": seconds, "holes": holes, "loss": losses}
+    return row | {"path_by_step": [e["path"] for e in steps]}, seen
 
 
 def _redrawn(setting: Setting, case: Case, stroke):
@@ -299,22 +327,22 @@ def main(options: Config) -> None:
     folder = results_folder("fit_stroke", options.out)
     setting = Setting()
     tools = make_tools(setting, LEVELS)
-    total = sum(level.steps for level in LEVELS)
+    total = OPENING + sum(level.steps for level in LEVELS)
     rows, shows = [], []
     with Progress(console=console, transient=True) as bar:
         task = bar.add_task("steps", total=options.strokes * total)
         for seed in range(options.strokes):
             case = make_case(setting, options, seed)
-            row, curves = run(tools, case, lambda: bar.advance(task))
+            row, curves = run(setting, tools, case, lambda: bar.advance(task))
             row = {"stroke": f"{FOUND[seed % len(FOUND)].replace('_', ' ')} {seed}", **row}
             rows.append(row)
             console.print(f"{row['stroke']}: {row['end']['path']:.4f} mm, {row['seconds']:.0f} s")
             again = partial(_redrawn, setting, case)
             shows.append(Show(row["stroke"], case, curves, row["path_by_step"], again, SIDE))
     shows = sorted(shows, key=lambda show: show.errors[-1])[:3]
-    strip(shows, (0, 15, 60, 180, total), folder / "fit_stroke.png")
+    strip(shows, (0, 1, OPENING, OPENING + 60, total), folder / "fit_stroke.png")
     film(shows[0], total, folder / "fit_stroke.gif")
-    chart(rows, LEVELS, BAR, folder / "fit_error.png")
+    chart(rows, OPENING, LEVELS, BAR, folder / "fit_error.png")
     found = sum(row["end"]["path"] < BAR for row in rows)
     write_run(folder, options, {"found": found, "bar": BAR, "levels": LEVELS, "strokes": rows})
     title = f"{found} of {len(rows)} strokes found to half a pixel: rms path error below {BAR:g} mm"
