@@ -19,6 +19,10 @@ from jaxbrush.brush import Surface as Surface  # noqa: E402
 from jaxbrush.brush import make_brush as make_brush  # noqa: E402
 from jaxbrush.brush import rollout as rollout  # noqa: E402
 from jaxbrush.brush import stable_dt as stable_dt  # noqa: E402
+from jaxbrush.models import Discriminator as Discriminator  # noqa: E402
+from jaxbrush.models import DiscriminatorConfig as DiscriminatorConfig  # noqa: E402
+from jaxbrush.models import Generator as Generator  # noqa: E402
+from jaxbrush.models import GeneratorConfig as GeneratorConfig  # noqa: E402
 from jaxbrush.raster import Grid as Grid  # noqa: E402
 from jaxbrush.raster import TrajectoryMaps as TrajectoryMaps  # noqa: E402
 from jaxbrush.raster import make_grid as make_grid  # noqa: E402
@@ -29,3 +33,8 @@ from jaxbrush.stylus import make_stroke as make_stroke  # noqa: E402
 from jaxbrush.stylus import random_stroke as random_stroke  # noqa: E402
 from jaxbrush.stylus import resample as resample  # noqa: E402
 from jaxbrush.stylus import transform as transform  # noqa: E402
+from jaxbrush.train import Batch as Batch  # noqa: E402
+from jaxbrush.train import TrainConfig as TrainConfig  # noqa: E402
+from jaxbrush.train import TrainParams as TrainParams  # noqa: E402
+from jaxbrush.train import make_params as make_params  # noqa: E402
+from jaxbrush.train import make_train as make_train  # noqa: E402

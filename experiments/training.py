@@ -1,0 +1,342 @@
+"""The loop that trains a network and reports on it: what train_height and train_color share."""
+
+import dataclasses
+import functools
+import json
+import os
+import time
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
+
+from experiments import evaluation
+from experiments.common import console, print_table, results_folder, write_run
+from experiments.evaluation import Pairs, Scale
+from jaxbrush import checkpoint
+from jaxbrush.models import DiscriminatorConfig, GeneratorConfig
+from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
+
+OUTPUTS = {"height": 1, "color": 3}
+
+
+@dataclasses.dataclass(frozen=True)
+class Options:
+    """Training of one network."""
+
+    out: Path | None = None
+    """Folder for checkpoints, pictures and numbers [default: results/train_KIND]."""
+    steps: int | None = None
+    """Updates in all, those before a resume included."""
+    minutes: float | None = 10.0
+    """Time for training in this run, compilation included."""
+    resume: bool = False
+    """Goes on from the last checkpoint in the folder; without one, starts."""
+    batch: int = 1
+    """Pairs an update sees."""
+    width: float = 1.0
+    """Factor on the generator's channels; 1 is the paper's."""
+    discriminator_width: float = 1.0
+    """Factor on the discriminator's channels."""
+    norm: str = "instance"
+    """instance, batch, masked or none."""
+    upsampling: str = "resize"
+    """resize or transposed."""
+    bf16: bool = False
+    """Convolutions in bfloat16."""
+    l1: float = 10.0
+    """Weight of the L1 loss."""
+    gan: float = 1.0
+    """Weight of the cGAN loss; 0 leaves the discriminator out."""
+    rate: float = 2e-4
+    """Adam's learning rate of the generator."""
+    discriminator_rate: float = 2e-4
+    """Adam's learning rate of the discriminator."""
+    average: bool = False
+    """Evaluates and exports a running average of the parameters."""
+    check_every: int = 200
+    """Updates between checkpoints, each with its error on held-out pairs and sample pictures."""
+    log_every: int = 10
+    """Updates between lines of metrics.jsonl; each is a mean over them."""
+    turns: bool = True
+    """Mirrors and turns pairs at random, by quarters."""
+    resident: float = 4.0
+    """Training pairs of up to so many GB are kept on the device, more are streamed."""
+    seed: int = 0
+    """Of the initial parameters and of the order of pairs."""
+
+
+class NotFinite(RuntimeError):
+    """A training that produced something that is not finite; says where to go on from."""
+
+
+def train_config(options: Options, kind: str) -> TrainConfig:
+    """The networks that the options ask for."""
+    dtype = "bfloat16" if options.bf16 else "float32"
+    norm = options.norm
+    judge = DiscriminatorConfig(options.discriminator_width, norm, dtype)
+    return TrainConfig(
+        GeneratorConfig(OUTPUTS[kind], options.width, norm, options.upsampling, dtype),
+        judge if options.gan > 0.0 else None,
+        options.average,
+    )
+
+
+@functools.lru_cache(maxsize=2)
+def _order(seed: int, epoch: int, count: int) -> np.ndarray:
+    return np.random.default_rng((seed, epoch)).permutation(count)
+
+
+def indices(seed: int, step: int, size: int, count: int) -> np.ndarray:
+    """Numbers of the pairs that update `step` sees: a pure function, so that a resumed run sees
+    the same ones. Every pair once before any comes again."""
+    at = range(step * size, (step + 1) * size)
+    return np.array([_order(seed, p // count, count)[p % count] for p in at], np.int32)
+
+
+def turned(batch, which):
+    """A batch (n, h, w, c) of square pictures, mirrored and turned: one of 8 ways."""
+    flips = [lambda x: x, lambda x: jnp.flip(x, 1), lambda x: jnp.flip(x, 2),
+             lambda x: jnp.flip(x, (1, 2))]  # fmt: skip
+    ways = flips + [lambda x, f=f: f(jnp.swapaxes(x, 1, 2)) for f in flips]
+    every = [lambda b, w=w: jax.tree.map(w, b) for w in ways]
+    return jax.lax.switch(which, every, batch)
+
+
+def make_batches(pairs: Pairs, options: Options):
+    """`batches(step) -> (Batch on the device, numbers of its pairs)`; the same whether all pairs
+    are on the device or not."""
+    device = jax.devices()[0]
+    size = sum(x.nbytes for x in jax.tree.leaves(pairs.batch))
+    resident = size <= options.resident * 1e9
+    where = jax.device_put if resident else jax.device_get
+    data = where(pairs.batch, device) if resident else where(pairs.batch)
+    gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
+    # The paint knows no direction, so every pair is worth eight.
+    turn = jax.jit(turned)
+
+    def batches(step: int):
+        index = indices(options.seed, step, options.batch, len(pairs))
+        if resident:
+            found = gather(data, jax.device_put(index, device))
+        else:
+            found = jax.device_put(jax.tree.map(lambda x: x[index], data), device)
+        if options.turns:
+            which = np.random.default_rng((options.seed, step)).integers(8)
+            found = turn(found, jax.device_put(np.int32(which), device))
+        return found, index
+
+    return batches
+
+
+def sample_grid(kind: str, found, pairs: Pairs, path: Path):
+    """Saves a row a pair: background, the stroke's map, network, truth, difference times 4."""
+    stroke = pairs.batch.inputs[..., OUTPUTS[kind] :][..., : OUTPUTS[kind]]
+    difference = np.abs(np.asarray(found) - np.asarray(pairs.batch.target)) * 4.0 - 1.0
+    columns = (pairs.background, stroke, found, pairs.batch.target, difference)
+    tiles = []
+    for picture in columns:
+        picture = np.clip(0.5 * (np.asarray(picture) + 1.0), 0.0, 1.0)
+        picture = np.pad(picture, ((0, 0), (2, 2), (2, 2), (0, 0)), constant_values=1.0)
+        tiles.append(np.concatenate(list(picture), axis=0))
+    sheet = (255.0 * np.concatenate(tiles, axis=1) + 0.5).astype(np.uint8)
+    coded, data = cv2.imencode(".png", sheet[..., ::-1])
+    if not coded:
+        raise ValueError(f"{path}: a sheet of {sheet.shape} cannot be coded")
+    checkpoint.replace_file(path, data.tobytes())
+
+
+class _Log:
+    """metrics.jsonl: means of the metrics of some updates, a line each."""
+
+    def __init__(self, path: Path, every: int, step: int):
+        kept = []
+        if path.exists():  # lines after the checkpoint that a run goes on from come again
+            lines = path.read_text().splitlines()
+            kept = [
+                line for line in lines if line.endswith("}") and json.loads(line)["step"] < step
+            ]
+        self.file = open(path, "w")
+        self.file.writelines(line + "\n" for line in kept)
+        self.every, self.parts = every, []
+
+    def add(self, step: int, metrics: dict):
+        self.parts.append(metrics)
+        if (step + 1) % self.every == 0:
+            means = {k: float(np.mean([m[k] for m in self.parts])) for k in metrics}
+            self.write(step, means)
+            self.parts = []
+
+    def write(self, step: int, values: dict):
+        self.file.write(json.dumps({"step": step, **values}) + "\n")
+        self.file.flush()
+
+
+def _start(init, params, pairs: Pairs, options: Options, checkpoints):
+    """(state, notes): from the last checkpoint that can be read, or new."""
+    few = jax.tree.map(lambda x: jnp.asarray(x[: options.batch]), pairs.batch)
+    key = jax.random.key(options.seed)
+    notes = {"seed": options.seed, "batch": options.batch, "pairs": len(pairs)}
+    folder = checkpoints.directory
+    if not options.resume:
+        if checkpoints.all_steps():
+            raise ValueError(f"{folder} has checkpoints: resume them, or use another folder")
+        # On a named device, as a restored state is: one compilation serves both.
+        return jax.device_put(init(key, few, params), jax.devices()[0]), notes
+    found = checkpoint.restore(checkpoints, jax.eval_shape(init, key, few, params))
+    if found is None:
+        return jax.device_put(init(key, few, params), jax.devices()[0]), notes
+    for step, reason in found.damaged.items():
+        console.print(f"[yellow]checkpoint {step} cannot be read and is passed over:[/] {reason}")
+        checkpoints.delete(step)
+    lines = checkpoint.differences(found.notes, notes)
+    if lines:
+        raise ValueError(f"{folder}: this run would see other pairs: {'; '.join(lines)}")
+    state = dataclasses.replace(found.state, params=jax.device_put(params, jax.devices()[0]))
+    return state, notes
+
+
+def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
+    """Trains until the budget of steps or minutes is spent.
+
+    Args:
+      kind: "height" or "color". train: pairs to learn from. held: a few others, whose masked error
+        chooses the best checkpoint.
+
+    Returns:
+      (TrainConfig, state of the best checkpoint, dict of numbers about the run).
+
+    Raises:
+      NotFinite: names the step, the pairs it saw and the last good checkpoint.
+      ValueError: neither steps nor minutes, or a folder whose checkpoints are of something else.
+    """
+    if options.steps is None and options.minutes is None:
+        raise ValueError("steps = None, minutes = None: expected one of them")
+    began = time.perf_counter()
+    chosen = train_config(options, kind)
+    init, update = make_train(chosen)
+    params = make_params(options.l1, options.gan, options.rate, options.discriminator_rate)
+    batches = make_batches(train, options)
+    held = jax.device_put(held)
+    seconds = np.inf if options.minutes is None else 60.0 * options.minutes
+    last_step = np.inf if options.steps is None else options.steps
+
+    with checkpoint.opened(folder / "checkpoints", chosen) as checkpoints:
+        state, notes = _start(init, params, train, options, checkpoints)
+        step = first = int(jax.device_get(state.step))
+        log = _Log(folder / "metrics.jsonl", options.log_every, step)
+        pending = None  # metrics of the update before: read late, so that the device never waits
+
+        def read(pending, bar, task):
+            at, index, metrics = pending
+            metrics = {k: float(v) for k, v in jax.device_get(metrics).items()}
+            if not metrics.pop("finite"):
+                checkpoints.wait_until_finished()
+                good = checkpoints.latest_step()
+                start = "there is no checkpoint yet"
+                if good is not None:
+                    start = f"the last good checkpoint is {checkpoints.directory / str(good)}"
+                raise NotFinite(
+                    f"step {at} is not finite: {metrics}, on pairs {index.tolist()}; {start}"
+                )
+            log.add(at, metrics)
+            text = " ".join(
+                f"{k} {metrics[k]:.3f}" for k in ("l1", "gan", "accuracy") if k in metrics
+            )
+            spent = max((time.perf_counter() - began) / seconds, (at + 1) / last_step)
+            bar.update(task, completed=min(spent, 1.0), text=f"step {at + 1}  {text}")
+
+        def check():
+            variables = inference_variables(state)
+            found = evaluation.paint(chosen.generator, variables, held.batch)
+            error = found - jax.device_get(held.batch.target)
+            mask = jax.device_get(held.batch.mask)
+            score = float(np.sqrt(np.sum(mask * error**2) / max(mask.sum() * error.shape[-1], 1.0)))
+            checkpoint.save(checkpoints, state, notes, score)
+            log.write(step - 1, {"held_rmse_masked": score})
+            sample_grid(kind, found[:4], held[:4], folder / "samples" / f"{step:07d}.png")
+
+        (folder / "samples").mkdir(parents=True, exist_ok=True)
+        columns = [TextColumn("{task.description}"), BarColumn(), TimeRemainingColumn(),
+                   TextColumn("{task.fields[text]}")]  # fmt: skip
+        with Progress(*columns, console=console) as bar:
+            task = bar.add_task(f"train {kind}", total=1.0, text="compiling")
+            looped = time.perf_counter()
+            while step < last_step and time.perf_counter() - began < seconds:
+                batch, index = batches(step)
+                state, metrics = update(state, batch)
+                if pending is not None:
+                    read(pending, bar, task)
+                pending = (step, index, metrics)
+                step += 1
+                if step == first + 1:
+                    jax.block_until_ready(state)
+                    looped = time.perf_counter()
+                if step % options.check_every == 0:
+                    read(pending, bar, task)
+                    pending = None
+                    check()
+            if pending is not None:
+                read(pending, bar, task)
+            trained = time.perf_counter()
+            if step not in checkpoints.all_steps():
+                check()
+        checkpoints.wait_until_finished()
+        log.file.close()
+        few = jax.tree.map(lambda x: jnp.asarray(x[: options.batch]), train.batch)
+        abstract = jax.eval_shape(init, jax.random.key(0), few, params)
+        best = checkpoint.restore(checkpoints, abstract, best=True)
+        best = state if best is None else best.state
+    numbers = {
+        "steps": step,
+        "best_step": int(jax.device_get(best.step)),
+        "seconds": time.perf_counter() - began,
+        "seconds_per_step": (trained - looped) / max(step - first - 1, 1),
+    }
+    return chosen, best, numbers
+
+
+def fit(
+    options: Options, kind: str, train: Pairs, held: Pairs, test: Pairs, scale: Scale,
+    data: str = "", command: str = "",
+) -> dict:  # fmt: skip
+    """Trains a network, compares it with the baselines on the test pairs, prints the table, and
+    leaves in the folder: checkpoints/, samples/, metrics.jsonl, config.json, metrics.json, and the
+    weights with their card as KIND.npz, KIND.md.
+
+    Args:
+      train, held, test: see `run`; no stroke is in two of them.
+      scale: of heights and pixels. data, command: for the card.
+
+    Returns:
+      What metrics.json holds: numbers of the run and, under "errors", those of `compare`.
+
+    Raises:
+      as `run`.
+    """
+    folder = results_folder(f"train_{kind}", options.out)
+    chosen, state, numbers = run(options, kind, train, held, folder)
+    variables = inference_variables(state)
+    found = evaluation.paint(chosen.generator, variables, test.batch)
+    rows = evaluation.compare(kind, found, test, scale)
+    sample_grid(kind, found[:6], test[:6], folder / "samples.png")
+    card = {
+        "command": command,
+        "data": data,
+        "pairs": f"{len(train)} for training, {len(test)} for the errors",
+        "steps": numbers["best_step"],
+        "device": f"{jax.devices()[0]}, {os.cpu_count()} cores",
+        "seconds": round(numbers["seconds"], 1),
+        "errors (network scale unless said otherwise)": rows["the network"],
+        "errors of copying the background": rows["copy the background"],
+        "errors of the preview stroke": rows["the preview stroke"],
+    }
+    checkpoint.export(folder / f"{kind}.npz", chosen.generator, variables, card)
+    write_run(folder, options, {"kind": kind, **numbers, "errors": rows})
+    names, texts = evaluation.table(kind, rows)
+    title = f"{kind}: {numbers['steps']} steps, best {numbers['best_step']}, {len(test)} test pairs"
+    print_table(title, names, texts, marked=0)
+    return {"kind": kind, **numbers, "errors": rows}

@@ -1,0 +1,25 @@
+"""What the two players of the training minimise (paper section 4.3)."""
+
+import jax
+import jax.numpy as jnp
+
+
+def l1(found, true):
+    """Mean absolute difference of two pictures of the same shape."""
+    return jnp.mean(jnp.abs(found - true))
+
+
+def fool(fake_logits):
+    """The generator's part of the cGAN loss, mean of -log D(G(x), x) over patches.
+
+    The non-saturating form (Goodfellow et al. 2014), as pix2pix has it: the paper's
+    log(1 - D(G(x), x)) has no slope where the discriminator wins. From logits, so that no
+    logarithm meets a zero.
+    """
+    return jnp.mean(jax.nn.softplus(-fake_logits))
+
+
+def tell_apart(real_logits, fake_logits):
+    """The discriminator's loss, mean of -log D(y, x) plus mean of -log(1 - D(G(x), x)), from
+    logits. A discriminator that cannot tell has 2 log 2."""
+    return jnp.mean(jax.nn.softplus(-real_logits)) + jnp.mean(jax.nn.softplus(fake_logits))
