@@ -1,14 +1,15 @@
-"""First pictures of the paint simulator: strokes over bare canvas, over each other, and corners.
+"""The paint catalogue: strokes by brush, pressure and load; layers; a small painting.
 
-python -m experiments.show_paint            # about 3 minutes
-python -m experiments.show_paint --quick    # one stroke
+python -m experiments.show_paint                    # three sheets
+python -m experiments.show_paint --only sea         # one of them
+python -m experiments.show_paint --quick            # four strokes
 """
 
 import dataclasses
 import os
 import time
 from pathlib import Path
-from typing import Annotated
+from typing import Literal
 
 import cv2
 import jax
@@ -18,109 +19,114 @@ import tyro
 from rich.progress import track
 
 from experiments.common import console, print_table, results_folder, write_run
-from jaxbrush.brush import BrushConfig, make_brush, rollout
+from experiments.paint_scenes import BRISTLES, NAMES, PALETTE, SCENES, brush_of, hand
+from jaxbrush.brush import BrushConfig, rollout
 from jaxbrush.canvas import flatten
 from jaxbrush.paint import (
     PaintConfig,
     empty_canvas,
     height,
     load_brush,
-    make_params,
     paint_stroke,
-    volume,
     weave,
 )
 from jaxbrush.render import picture, shade
-from jaxbrush.stylus import make_stroke, resample
 
-PALETTE = {
-    "white": (0.92, 0.90, 0.84), "orange": (0.80, 0.16, 0.02), "green": (0.02, 0.25, 0.10),
-    "black": (0.02, 0.02, 0.03),
-}  # fmt: skip
-"""Pigments, linear RGB."""
-STAMPS, SPEED = 320, 60.0
-"""Stamps a stroke is padded to; speed of the hand [mm/s]."""
-BRISTLES = 260
-SHAPE = (160, 288)
-"""Canvas [pixels]."""
-
-# Color, load, pressure, corners of the path [mm].
-STROKES = (
-    ("green", 0.8, 0.5, ((4, 4), (33, 4))),
-    ("green", 0.8, 0.5, ((8, 9), (8, 19))),
-    ("black", 0.8, 0.5, ((16, 9), (16, 19))),
-    ("orange", 0.8, 0.5, ((3, 14), (33, 14))),
-    ("white", 0.8, 0.4, ((26, 18), (30, 9), (34, 17))),
-)
+SHAPE = (264, 576)
+"""Canvas of every sheet [pixels]: one compilation; cut to its own size at the end."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Pictures of painted strokes."""
 
-    out: Annotated[Path | None, tyro.conf.arg(help="Folder for the pictures.")] = None
+    out: Path | None = None
     """Folder for the pictures [default: results/show_paint]."""
+    only: Literal["strokes", "layers", "sea"] | None = None
+    """One sheet of the three."""
     quick: bool = False
-    """The first stroke only."""
-    scale: int = 4
-    """Enlargement of the picture."""
+    """Four strokes of the first sheet."""
+    scale: int = 3
+    """Enlargement of the pictures."""
 
 
-def hand(corners, pressure: float, pixel: float, depth: float = 5.0):
-    """A stroke through rounded corners, stamps a pixel of the handle's way apart, pressed and
-    lifted at its ends."""
-    corners = np.asarray(corners, float)
-    u = np.linspace(0.0, 1.0, 400)
-    at = np.linspace(0.0, 1.0, len(corners))
-    path = np.stack([np.interp(u, at, corners[:, k]) for k in (0, 1)], 1)
-    soft = np.hanning(41) / np.hanning(41).sum()
-    path = np.pad(path, ((20, 20), (0, 0)), mode="edge")
-    path = np.stack([np.convolve(path[:, k], soft, "valid") for k in (0, 1)], 1)
-    way = np.concatenate([[0.0], np.cumsum(np.hypot(*np.diff(path, axis=0).T))])
-    share = way / way[-1]
-    press = pressure * np.clip(np.minimum(share / 0.12, (1.0 - share) / 0.15), 0.0, 1.0)
-    heading = np.arctan2(*(path[-1] - path[0])[::-1])
-    stroke = make_stroke(path, way / SPEED, press, altitude=np.radians(50.0), azimuth=heading)
-    return resample(stroke, STAMPS, pixel, np.inf, depth)
+def held(brush) -> float:
+    """Volume of the paint in a brush [mm^3]; summed in float64, as a budget should be."""
+    return float(sum(np.asarray(part, np.float64).sum() for part in (brush.tip, brush.reservoir)))
 
 
-def main(options: Config) -> None:
-    folder = results_folder("show_paint", options.out)
-    config, params, brush_config = PaintConfig(), make_params(), BrushConfig()
-    brush = make_brush(jax.random.key(0), brush_config, "flat", BRISTLES, width=4.5, thickness=1.4)
+def total(config: PaintConfig, canvas, brush) -> float:
+    """Volume of the paint on canvas and brush [mm^3]."""
+    return config.cell * float(np.asarray(canvas).sum(dtype=np.float64)) + held(brush)
+
+
+def paint(config: PaintConfig, touches, say: str):
+    """Paints strokes one after the other.
+
+    Returns:
+      (canvas, list of numbers of each stroke).
+    """
+    brush_config = BrushConfig()
     move, lay = jax.jit(rollout), jax.jit(paint_stroke)
     tooth = jnp.asarray(weave(SHAPE, config.pixel), float)
-    canvas = empty_canvas(config, SHAPE)
-    names = list(PALETTE)
-    rows, strokes = [], STROKES[:1] if options.quick else STROKES
-    for color, load, pressure, corners in track(strokes, "strokes", console=console):
-        mix = jnp.asarray([float(n == color) for n in names])
-        stroke = hand(corners, pressure, config.pixel)
+    canvas, rows = empty_canvas(config, SHAPE), []
+    for touch in track(touches, say, console=console):
+        brush, params, depth = brush_of(touch.brush, brush_config)
+        stroke = hand(touch.corners, touch.pressure, config.pixel, depth, touch.fall)
         bristles = move(brush_config, brush, stroke)
-        full = load_brush(config, params, BRISTLES, load, mix)
-        before = float(volume(config, canvas).sum() + full.tip.sum() + full.reservoir.sum())
+        mix = jnp.asarray([touch.color.get(name, 0.0) for name in NAMES])
+        full = load_brush(config, params, BRISTLES, touch.load, mix)
+        before = total(config, canvas, full)
         start = time.perf_counter()
         canvas, left, report = jax.block_until_ready(
             lay(config, params, canvas, full, bristles, tooth)
         )
         seconds = time.perf_counter() - start
-        kept = float(left.tip.sum() + left.reservoir.sum())
-        now = float(volume(config, canvas).sum()) + kept
+        now = total(config, canvas, left)
         rows.append(
-            [color, f"{float(full.tip.sum() + full.reservoir.sum()) - kept:.2f}",
-             f"{(now - before) / before:.1e}", f"{float(height(config, canvas).max()):.2f}",
-             f"{float(report.fullest.max()):.4f}", f"{1e3 * seconds / STAMPS:.0f}"]
-        )  # fmt: skip
-    seen = flatten(canvas, config.layer, jnp.asarray(list(PALETTE.values())), mixing="subtractive")
+            {
+                "brush": touch.brush,
+                "laid": held(full) - held(left),
+                "drift": (now - before) / max(before, 1e-9),
+                "highest": float(height(config, canvas).max()),
+                "ms": 1e3 * seconds / int(stroke.valid.sum()),
+            }
+        )
+    return canvas, rows
+
+
+def render(config: PaintConfig, canvas, shape, scale: int) -> np.ndarray:
+    """The lit canvas, cut to `shape` pixels, 8-bit BGR."""
+    palette = jnp.asarray(list(PALETTE.values()))
+    seen = flatten(canvas, config.layer, palette, mixing="subtractive")
+    tooth = jnp.asarray(weave(SHAPE, config.pixel), float)
     image = np.asarray(picture(shade(seen, config.pixel, weave=tooth)))
-    size = (SHAPE[1] * options.scale, SHAPE[0] * options.scale)
-    image = cv2.resize(image[..., ::-1], size, interpolation=cv2.INTER_CUBIC)
-    # Written under another name first, so that no half picture is left behind.
-    cv2.imwrite(str(folder / "partial.png"), image)
-    os.replace(folder / "partial.png", folder / "paint.png")
-    columns = ["stroke", "laid [mm³]", "volume drift", "highest [mm]", "fullest cell", "ms a stamp"]
-    write_run(folder, options, {"strokes": [dict(zip(columns, r, strict=True)) for r in rows]})
-    print_table("Strokes (the first includes compilation)", columns, rows)
+    image = image[: shape[0], : shape[1], ::-1]
+    return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
+
+
+def main(options: Config) -> None:
+    folder = results_folder("show_paint", options.out)
+    config = dataclasses.replace(PaintConfig(), pigments=len(PALETTE))
+    table, numbers = [], {}
+    for name, (shape, touches) in SCENES.items():
+        if options.only not in (None, name) or (options.quick and name != "strokes"):
+            continue
+        touches = touches()[: 4 if options.quick else None]
+        canvas, rows = paint(config, touches, name)
+        # Written under another name first, so that no half picture is left behind.
+        cv2.imwrite(str(folder / "partial.png"), render(config, canvas, shape, options.scale))
+        os.replace(folder / "partial.png", folder / f"{name}.png")
+        numbers[name] = rows
+        column = lambda key, rows=rows: [row[key] for row in rows]  # noqa: E731
+        table.append(
+            [name, len(rows), f"{sum(column('laid')):.0f}",
+             f"{max(map(abs, column('drift'))):.1e}", f"{column('highest')[-1]:.2f}",
+             f"{np.median(column('ms')):.0f}"]
+        )  # fmt: skip
+    write_run(folder, options, numbers)
+    columns = ["sheet", "strokes", "laid [mm³]", "largest drift", "highest [mm]", "ms a stamp"]
+    print_table(f"Painted, pictures in {folder}", columns, table)
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from jaxbrush.structs import state
 class PaintReport:
     """What a stroke did, by stamp. residual: (t, 4) of the viscous solves and the pressure.
     fullest: (t,) largest fill of a cell; above 1 only in the top layer. reached: (t,) whether all
-    bristles that touch were inside the window."""
+    bristles low over the canvas were inside the window."""
 
     residual: jax.Array
     fullest: jax.Array
@@ -113,16 +113,21 @@ def paint_stroke(
         points = hair(config, params, local(a), local(b), dt, active)
         window = jax.lax.dynamic_slice(canvas, (0, 0, y, x), (layers, k, size, size))
         cloth = jax.lax.dynamic_slice(tooth, (y, x), (size, size))
-        painted, wet, residual = stamp(config, params, window, brush, points, cloth)
-        painted = jnp.where(valid, painted, window)
-        wet = jax.tree.map(lambda new, old: jnp.where(valid, new, old), wet, brush)
+        # Padding costs nothing. (Under vmap both branches run, and the right one is taken.)
+        painted, wet, residual = jax.lax.cond(
+            valid,
+            lambda: stamp(config, params, window, brush, points, cloth),
+            lambda: (window, brush, jnp.zeros(4, window.dtype)),
+        )
         canvas = jax.lax.dynamic_update_slice(canvas, painted, (0, 0, y, x))
-        side = size * config.pixel
+        # Hair over the canvas's edge is not missed.
         tip = local(b)[1]
-        out = (tip[0] < 0.0) | (tip[0] > side) | (tip[1] < 0.0) | (tip[1] > side)
-        low = tip[2] < config.layer * layers
+        edge = jnp.asarray([w, h], canvas.dtype) * config.pixel - offset[:2]
+        there = jnp.all((tip[:2] >= -offset[:2, None]) & (tip[:2] <= edge[:, None]), axis=0)
+        seen = jnp.all((tip[:2] >= 0.0) & (tip[:2] <= size * config.pixel), axis=0)
+        missed = jnp.any(there & ~seen & (tip[2] < config.layer * layers))
         fullest = jnp.max(jnp.sum(painted[:-1], axis=1))
-        return (canvas, wet), (residual, fullest, ~jnp.any(out & low) | ~valid)
+        return (canvas, wet), (residual, fullest, ~missed | ~valid)
 
     (canvas, brush), seen = jax.lax.scan(
         body, (canvas, brush), (before, nodes, dt, corner, track.valid)

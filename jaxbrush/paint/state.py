@@ -1,5 +1,7 @@
 """What the paint simulator is made of: grid, constants, and the paint on canvas and brush."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -110,6 +112,30 @@ def make_params(**changes) -> PaintParams:
     if unknown:
         raise ValueError(f"{sorted(unknown)}: expected names among {sorted(values)}")
     return PaintParams(**{k: jnp.asarray(v, float) for k, v in (values | changes).items()})
+
+
+TUNED_AREA, TUNED_HAIRS = 4.5 * 1.4, 260
+"""Ferrule [mm^2] and hair count of the brush that the default constants belong to."""
+
+
+def for_brush(params: PaintParams, width, thickness, hairs: int, disc: bool = False) -> PaintParams:
+    """The constants for a brush of another size or hair count: it holds paint by the area of its
+    ferrule, and fewer hairs are thicker under the same coat.
+
+    Args:
+      width, thickness: of the ferrule [mm]. hairs: simulated bristles. disc: round ferrule.
+    """
+    share = width * thickness / TUNED_AREA * (0.25 * np.pi if disc else 1.0)
+    thicker = jnp.sqrt(share * TUNED_HAIRS / hairs)
+    return dataclasses.replace(
+        params,
+        tip_volume=params.tip_volume * share,
+        reservoir_volume=params.reservoir_volume * share,
+        contact_area=params.contact_area * share,
+        hair_radius=params.hair_radius * thicker,
+        coat_dry=params.coat_dry / thicker,
+        coat_full=params.coat_full / thicker,
+    )
 
 
 @state

@@ -99,6 +99,45 @@ def divergence(face, width: int):
     return total
 
 
+def pressure_system(config: PaintConfig, params: PaintParams, fill, phi, face):
+    """The pressure's equations in one stamp.
+
+    Args:
+      face: wide displacements.
+
+    Returns:
+      (Matrix, right-hand side (z, 1, n), wide `lid`: how far faces up into air are open).
+    """
+    one, width = 1.0 + 0.0 * params.drag, config.window
+    liquid = (fill + phi >= 0.5).astype(fill.dtype)
+    source = params.source * jnp.maximum(fill + phi - 1.0, 0.0)
+    lid = wide(1.0 - params.lid * jnp.minimum(1.0, phi / 0.15), width)
+    wet = wide(liquid, width)
+
+    # What a liquid cell adds for its neighbours of air.
+    here, extra = near(wet, width), 0.0
+    for sign in (-1, 1):
+        walls = _walls(width, min(sign, 0))
+        for shift, wall in zip((1, width), walls, strict=True):
+            air = 1.0 - near(wet, width, sign * shift)
+            extra = extra + jnp.asarray(wall, fill.dtype)[None] * air
+    above, below = near(wet, width, 0, 1), near(wet, width, 0, -1)
+    top = jnp.ones((config.layers, 1), fill.dtype).at[-1].set(0.0)
+    bottom = jnp.ones((config.layers, 1), fill.dtype).at[0].set(0.0)
+    open_ = top * (1.0 - above) * near(lid, width) + bottom * (1.0 - below) * near(
+        lid, width, 0, -1
+    )
+    extra = jnp.where(here > 0.0, extra + config.ratio * open_, 1.0)
+    matrix = Matrix(wet, jnp.maximum(extra, 1e-6) / one, config.ratio, width)
+    rhs = (liquid * (source - divergence(face, width)))[:, None] / one
+    return matrix, rhs, lid
+
+
+def _walls(width: int, step: int = 0):
+    """(n,) 1 where a face along x, and along y, `step` cells on lies inside the window."""
+    return inner_x(width, width, step), inner_y(width, width, step * width)
+
+
 def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     """Makes the displacement volume-preserving where there is liquid.
 
@@ -112,39 +151,20 @@ def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     Returns:
       (three faces (z, n), relative residual (1,)).
     """
-    one, width = 1.0 + 0.0 * params.drag, config.window
-    liquid = (fill + phi >= 0.5).astype(fill.dtype)
-    source = params.source * jnp.maximum(fill + phi - 1.0, 0.0)
-    lid = wide(1.0 - params.lid * jnp.minimum(1.0, phi / 0.15), width)
-    wet = wide(liquid, width)
-    walls = [(inner_x(width, width, k), inner_y(width, width, k * width)) for k in (-1, 0)]
-    shifts = (1, width)
-
-    # What a liquid cell adds for its neighbours of air.
-    here, extra = near(wet, width), 0.0
-    for axis, shift in enumerate(shifts):
-        for sign, wall in ((-1, walls[0][axis]), (1, walls[1][axis])):
-            air = 1.0 - near(wet, width, sign * shift)
-            extra = extra + jnp.asarray(wall, fill.dtype)[None] * air
-    above, below = near(wet, width, 0, 1), near(wet, width, 0, -1)
-    top = jnp.ones((config.layers, 1), fill.dtype).at[-1].set(0.0)
-    bottom = jnp.ones((config.layers, 1), fill.dtype).at[0].set(0.0)
-    open_ = top * (1.0 - above) * near(lid, width) + bottom * (1.0 - below) * near(
-        lid, width, 0, -1
-    )
-    extra = jnp.where(here > 0.0, extra + config.ratio * open_, 1.0)
-    matrix = Matrix(wet, jnp.maximum(extra, 1e-6) / one, config.ratio, width)
-    rhs = (liquid * (source - divergence(face, width)))[:, None] / one
+    width = config.window
+    matrix, rhs, lid = pressure_system(config, params, fill, phi, face)
     p = solve(config.solver, matrix, rhs, config.pressure, config.spectrum)
     left = residual(matrix, p[..., width:-width], rhs)
     p = jnp.pad(p[:, 0], ((1, 1), (0, 0)))
 
-    moved = []
-    for axis, shift in enumerate(shifts):
+    wet, moved = matrix.link, []
+    here, above = near(wet, width), near(wet, width, 0, 1)
+    for f, shift, wall in zip(face[:2], (1, width), _walls(width), strict=True):
         weight = jnp.maximum(here, near(wet, width, shift))
-        weight = weight * jnp.asarray(walls[1][axis], fill.dtype)[None]
+        weight = weight * jnp.asarray(wall, fill.dtype)[None]
         drop = near(p, width, shift) - near(p, width)
-        moved.append(near(face[axis], width) - weight * drop)
+        moved.append(near(f, width) - weight * drop)
+    top = jnp.ones((config.layers, 1), fill.dtype).at[-1].set(0.0)
     weight = jnp.maximum(here * above, jnp.maximum(here, above) * near(lid, width)) * top
     drop = near(p, width, 0, 1) - near(p, width)
     moved.append(near(face[2], width) - config.ratio * weight * drop)

@@ -1,0 +1,76 @@
+"""What train_height and train_color are: data set, training, errors, pictures, weights."""
+
+import dataclasses
+import sys
+from pathlib import Path
+from typing import Literal
+
+import numpy as np
+
+from experiments import make_dataset, training
+from experiments.common import console
+from experiments.evaluation import Pairs, Scale
+from jaxbrush import data
+
+HELD = 2
+"""Canvases of the training split, at most, that choose the best checkpoint and are not learned
+from; the test split is seen once, at the end."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config(training.Options):
+    """Trains a network on a data set, which is made first if it is not there."""
+
+    preset: Literal["tiny", "small", "paper"] = "tiny"
+    """Data set (see make_dataset)."""
+    data: Path | None = None
+    """Folder of the data set [default: results/data_<preset>]."""
+    sweeps: bool = False
+    """Height: the sweep count in place of the pressure (paper Figure 3)."""
+    time: bool = True
+    """Color: with the time map (paper Figure 4)."""
+    height: bool = True
+    """Color: with the new height (paper Figure 5)."""
+
+
+def pairs_of(found: data.Dataset, split: str, index, kind: str, options: Config) -> Pairs:
+    """Pairs of a data set in network scale."""
+    raw = found.take(split, index)
+    shown = data.preview(raw)
+    if kind == "height":
+        batch = data.height_batch(raw, options.sweeps)
+        return Pairs(batch, data.network_height(shown["new_height"]))
+    batch = data.color_batch(raw, options.time, options.height)
+    return Pairs(batch, 2.0 * shown["new_color"] - 1.0)
+
+
+def main(kind: str, options: Config) -> None:
+    try:
+        folder = make_dataset.build(options.preset, options.data)
+        found = data.load(folder)
+    except data.DataError as error:
+        raise SystemExit(f"{error}") from error
+    strokes = found.options.pairs.strokes
+    held = strokes * min(HELD, max(1, found.options.train // 10))
+    numbers = np.arange(found.count("train"))
+    take = lambda split, index: pairs_of(found, split, index, kind, options)  # noqa: E731
+    size, tests = found.options.pairs.size, found.count("test")
+    about = (
+        f"{options.preset}, seed {found.seed}: {len(numbers)} + {tests} pairs of {size} x {size}"
+    )
+    scale = Scale(data.LEVELS["height"], found.options.pairs.paint.pixel)
+    try:
+        training.fit(
+            options,
+            kind,
+            take("train", numbers[:-held]),
+            take("train", numbers[-held:]),
+            take("test", np.arange(tests)),
+            scale,
+            data=about,
+            command=f"python -m experiments.train_{kind} {' '.join(sys.argv[1:])}".strip(),
+        )
+    except (ValueError, training.NotFinite) as error:
+        raise SystemExit(f"{error}") from error
+    where = options.out or Path("results") / f"train_{kind}"
+    console.print(f"pictures: {where / 'samples.png'}   weights: {where / (kind + '.npz')}")

@@ -1,0 +1,228 @@
+"""Training pairs from the simulator: a canvas before and after one more stroke (paper 4.2).
+
+A canvas is painted stroke by stroke, and every stroke gives a pair: what lay there, the maps of
+the stroke, and what the simulator made of it. Pair i is stroke i % strokes on canvas
+i // strokes, so it depends on (config, seed, i) only.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, make_brush, rollout
+from jaxbrush.canvas import flatten, from_srgb, to_srgb
+from jaxbrush.paint import (
+    BrushPaint,
+    PaintConfig,
+    PaintParams,
+    empty_canvas,
+    for_brush,
+    load_brush,
+    make_params,
+    paint_stroke,
+    weave,
+)
+from jaxbrush.raster import make_grid, trajectory_maps
+from jaxbrush.raster.grid import dilate
+from jaxbrush.structs import config, state
+from jaxbrush.stylus import Stroke, random_stroke, resample, transform
+
+SHAPES = ("flat", "filbert", "round")
+COAT = 0.2
+"""[mm] above the canvas at which the paint on a bristle touches it."""
+MARGIN = 32
+"""Pixels of canvas around what is kept, so that a stroke over its edge piles nothing up there."""
+REACH = 8
+"""Pixels beyond the bristles that a stroke may change: how far the mask is dilated."""
+
+
+@config
+class PairConfig:
+    """size: of the canvas, square [pixels]. strokes: painted on each canvas, one pair each. stamps:
+    of a stroke at most; longer ones are made smaller. bristles: simulated. paint, brush: the
+    simulators."""
+
+    size: int = 128
+    strokes: int = 4
+    stamps: int = 160
+    bristles: int = 128
+    paint: PaintConfig = PaintConfig(window=48)  # noqa: RUF009
+    brush: BrushConfig = BrushConfig()  # noqa: RUF009
+
+    def __post_init__(self):
+        for name, least in (("strokes", 1), ("stamps", 8), ("bristles", 1)):
+            if getattr(self, name) < least:
+                raise ValueError(f"PairConfig.{name} = {getattr(self, name)}: expected >= {least}")
+        if self.size < self.paint.window or self.size % 4:
+            raise ValueError(
+                f"PairConfig.size = {self.size}: expected a multiple of 4, at least the window, "
+                f"{self.paint.window}"
+            )
+
+
+@state
+class Plan:
+    """One stroke, drawn at random. mix: (k,) shares of the pigments on the brush. load: ()."""
+
+    stroke: Stroke
+    brush: BrushParams
+    paint: PaintParams
+    mix: jax.Array
+    load: jax.Array
+
+
+@state
+class Picture:
+    """What a pair stores of a canvas and a stroke; colors in sRGB, [0, 1].
+
+    height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
+    time: (h, w) and trajectory: (h, w, 3) maps of the stroke. mask: (h, w) 1 where it may have
+    changed something. reached: () whether the brush stayed inside the simulated window.
+    """
+
+    height: jax.Array
+    color: jax.Array
+    pressure: jax.Array
+    sweeps: jax.Array
+    trajectory: jax.Array
+    time: jax.Array
+    new_height: jax.Array
+    new_color: jax.Array
+    mask: jax.Array
+    reached: jax.Array
+
+
+def draw_palette(key, pigments: int):
+    """(k, 3) linear RGB as a painter squeezes them out: whites, earths, a few strong colors."""
+    hue, chroma, value = jax.random.uniform(key, (3, pigments))
+    # From HSV; saturation falls off for the lightest.
+    value = 0.08 + 0.87 * value
+    chroma = 0.95 * chroma * (1.0 - 0.5 * value**3)
+    wheel = jnp.abs(jnp.mod(6.0 * hue[:, None] + jnp.array([0.0, 4.0, 2.0])[None], 6.0) - 3.0) - 1.0
+    return from_srgb(value[:, None] * (1.0 - chroma[:, None] * (1.0 - jnp.clip(wheel, 0.0, 1.0))))
+
+
+def _draw_stroke(options: PairConfig, key, depth):
+    """A stroke that fits the canvas and the stamps, turned at random; it may leave the canvas."""
+    own, turn, shift = jax.random.split(key, 3)
+    side = options.size * options.paint.pixel
+    stroke = random_stroke(own, 128, 0.8 * side)
+    # The way of the handle, lifting included, must not ask for more stamps than there are.
+    way = jnp.sum(jnp.sqrt(jnp.sum(jnp.diff(stroke.position, axis=0) ** 2, axis=1) + 1e-12))
+    lift = depth * jnp.sum(jnp.abs(jnp.diff(stroke.pressure)))
+    room = jnp.maximum(0.95 * options.stamps * options.paint.pixel - lift, 1.0)
+    middle = 0.5 * (stroke.position.max(0) + stroke.position.min(0))
+    place = jax.random.uniform(shift, (2,), minval=0.25 * side, maxval=0.75 * side)
+    stroke = transform(
+        stroke,
+        rotate=jax.random.uniform(turn, (), maxval=2.0 * np.pi),
+        translate=place - middle,
+        scale=jnp.minimum(1.0, room / way),
+        center=middle,
+    )
+    return resample(stroke, options.stamps, options.paint.pixel, np.inf, depth)
+
+
+def draw(options: PairConfig, key) -> Plan:
+    """Draws one stroke: brush, hand, load and color."""
+    shape, size, hair, hand, color, load = jax.random.split(key, 6)
+    name = SHAPES[int(jax.random.randint(shape, (), 0, len(SHAPES)))]
+    low, high = (1.4, 2.8) if name == "round" else (1.8, 4.0)
+    width = jax.random.uniform(size, (), minval=low, maxval=high)
+    thickness = width if name == "round" else jnp.maximum(0.7, 0.3 * width)
+    length = 6.0 + 3.0 * width
+    brush = make_brush(
+        hair, options.brush, name, options.bristles, width=width, thickness=thickness,
+        length=length, press_depth=0.25 * length,
+    )  # fmt: skip
+    disc = name == "round"
+    paint = for_brush(make_params(), width, thickness, options.bristles, disc)
+    first, second, blend = jax.random.split(color, 3)
+    pick = lambda k: jax.nn.one_hot(  # noqa: E731
+        jax.random.randint(k, (), 0, options.paint.pigments), options.paint.pigments
+    )
+    # Every third stroke is mixed from two.
+    share = jnp.maximum(0.0, jax.random.uniform(blend, (), minval=-1.0, maxval=0.5))
+    return Plan(
+        stroke=_draw_stroke(options, hand, 0.25 * length),
+        brush=brush,
+        paint=paint,
+        mix=(1.0 - share) * pick(first) + share * pick(second),
+        load=jax.random.uniform(load, (), minval=0.7, maxval=1.0),
+    )
+
+
+def coated(track: BristleTrack, coat: float = COAT) -> BristleTrack:
+    """The track as maps of a loaded brush see it: a bristle touches where its coat of paint does,
+    `coat` [mm] above the canvas, there without force."""
+    near = (track.position[:, :, 2] < coat) & track.valid[:, None, None]
+    return dataclasses.replace(track, force=jnp.where(near, jnp.maximum(track.force, 1e-3), 0.0))
+
+
+def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
+    """Paints one stroke of a plan. Pure; jit and vmap it.
+
+    Args:
+      canvas, tooth: with `MARGIN` pixels more on each side than the pair keeps.
+
+    Returns:
+      (canvas after (z, k, y, x), Picture).
+    """
+    track = rollout(options.brush, plan.brush, plan.stroke)
+    edge = MARGIN * options.paint.pixel
+    shift = jnp.asarray([edge, edge, 0.0], track.position.dtype)[:, None]
+    moved = dataclasses.replace(track, position=track.position + shift)
+    loaded: BrushPaint = load_brush(
+        options.paint, plan.paint, options.bristles, plan.load, plan.mix
+    )
+    after, _, report = paint_stroke(options.paint, plan.paint, canvas, loaded, moved, tooth)
+    kept = slice(MARGIN, MARGIN + options.size)
+    seen = lambda c: flatten(  # noqa: E731
+        c[:, :, kept, kept], options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
+    )
+    # The color of the load as thick paint shows it.
+    thick = plan.mix[None, :, None, None] * jnp.full((1, 1, 1, 1), 1e3)
+    own = flatten(
+        thick, options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
+    ).color[0, 0]
+    grid = make_grid((options.size, options.size), pixel=options.paint.pixel)
+    maps = trajectory_maps(grid, coated(track), to_srgb(own))
+    before, now = seen(canvas), seen(after)
+    return after, Picture(
+        height=before.height,
+        color=to_srgb(before.color),
+        pressure=maps.pressure,
+        sweeps=maps.sweeps,
+        trajectory=maps.color,
+        time=maps.time,
+        new_height=now.height,
+        new_color=to_srgb(now.color),
+        mask=dilate(maps.coverage, REACH),
+        reached=jnp.all(report.reached),
+    )
+
+
+_paint_pair = jax.jit(paint_pair)
+
+
+def canvas_pairs(options: PairConfig, seed: int, number: int):
+    """All pairs of one canvas.
+
+    Args:
+      seed: of the data set. number: of the canvas.
+
+    Returns:
+      list of `strokes` Pictures, numpy arrays.
+    """
+    key = jax.random.fold_in(jax.random.key(seed), number)
+    palette = draw_palette(jax.random.fold_in(key, 0), options.paint.pigments)
+    shape = (options.size + 2 * MARGIN,) * 2
+    tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
+    canvas, pictures = empty_canvas(options.paint, shape), []
+    for stroke in range(options.strokes):
+        plan = draw(options, jax.random.fold_in(key, stroke + 1))
+        canvas, picture = _paint_pair(options, plan, palette, canvas, tooth)
+        pictures.append(jax.tree.map(np.asarray, picture))
+    return pictures

@@ -1,0 +1,139 @@
+"""Training pairs: what they hold, and that no damage to a data set goes unnoticed."""
+
+import dataclasses
+import json
+
+import jax
+import numpy as np
+import pytest
+
+from jaxbrush import data, pairs
+from jaxbrush.paint import PaintConfig
+
+SMALL = pairs.PairConfig(
+    size=48, strokes=2, stamps=24, bristles=24,
+    paint=PaintConfig(window=32, layers=8, pigments=3, samples=2, sweeps=1, viscous=2, pressure=4),
+)  # fmt: skip
+OPTIONS = data.DataConfig(SMALL, train=2, test=1, shard=1)
+SEED = 3
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    path = data.start(tmp_path_factory.mktemp("data"), OPTIONS, SEED)
+    for number in range(OPTIONS.shards):
+        data.make_shard(path, OPTIONS, SEED, number)
+    return path
+
+
+@pytest.fixture
+def copy(folder, tmp_path):
+    for file in folder.iterdir():
+        (tmp_path / file.name).write_bytes(file.read_bytes())
+    return tmp_path
+
+
+def test_a_pair_depends_on_its_seed_and_number_only(folder):
+    found = data.load(folder)
+    alone = pairs.canvas_pairs(SMALL, SEED, 1)[1]
+    stored = found.take("train", [3])
+    for name, _ in data.CHANNELS:
+        level = data.LEVELS.get(name.removeprefix("new_"), 1.0)
+        want = np.clip(getattr(alone, name), 0.0, level)
+        np.testing.assert_allclose(np.squeeze(stored[name]), want, atol=0.51 * level / data.FULL)
+    other = pairs.canvas_pairs(SMALL, SEED + 1, 1)[1]
+    assert np.abs(other.new_height - alone.new_height).max() > 0.02
+
+
+def test_a_stroke_changes_its_mask_and_is_the_next_background(folder):
+    found = data.load(folder)
+    assert (found.count("train"), found.count("test")) == (4, 2)
+    p = found.take("train", [0, 1])
+    changed = np.abs(p["new_height"] - p["height"])
+    assert changed.max() > 0.03
+    # Paint on the sides of a bristle may reach a little further than its coat at the tip.
+    assert (changed * (1.0 - p["mask"])).sum() < 0.01 * changed.sum()
+    assert p["mask"].mean() < 0.9
+    np.testing.assert_array_equal(p["new_height"][0], p["height"][1])
+    np.testing.assert_array_equal(p["new_color"][0], p["color"][1])
+    assert p["height"][0].max() == 0.0
+    # Where no bristle came, the maps are empty.
+    bare = p["mask"] == 0.0
+    for name in ("pressure", "sweeps", "time"):
+        assert np.all(p[name][bare] == 0.0)
+
+
+def test_batches_are_in_network_scale(folder):
+    p = data.load(folder).take("test", [0, 1])
+    height = data.height_batch(p)
+    assert height.inputs.shape == (2, 48, 48, 2) and height.target.shape == (2, 48, 48, 1)
+    color = data.color_batch(p)
+    assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
+    assert data.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
+    for batch in (height, color, data.height_batch(p, sweeps=True)):
+        for x in jax.tree.leaves(batch):
+            assert x.dtype == np.float32
+            assert float(x.min()) >= -1.0 and float(x.max()) <= 1.0
+    shown = data.preview(p)
+    same = (p["time"] == 0.0) & (p["pressure"] == 0.0)
+    assert np.all(np.asarray(shown["new_height"])[same] == p["height"][same])
+
+
+def test_an_interrupted_shard_is_made_again_the_same(copy):
+    path = data.shard_path(copy, 1)
+    before = path.read_bytes()
+    # Killed before the shard was whole: no note of it.
+    path.with_suffix(".json").unlink()
+    path.write_bytes(before[:1000])
+    with pytest.raises(data.DataError, match="shard-00001.json"):
+        data.load(copy)
+    data.make_shard(copy, OPTIONS, SEED, 1)
+    assert path.read_bytes() == before
+    data.load(copy)
+    assert not list(copy.glob("*.partial*"))
+
+
+@pytest.mark.parametrize("damage", ["truncated", "flipped", "foreign"])
+def test_a_damaged_shard_is_named_and_refused(copy, damage):
+    path = data.shard_path(copy, 2)
+    raw = bytearray(path.read_bytes())
+    if damage == "truncated":
+        raw = raw[: len(raw) // 2]
+    elif damage == "flipped":
+        raw[-7] ^= 1
+    if damage == "foreign":
+        np.save(path, np.zeros((4, 15, 32, 32), np.uint16))
+    else:
+        path.write_bytes(raw)
+    with pytest.raises(data.DataError, match="shard-00002"):
+        data.load(copy)
+
+
+def test_another_data_set_is_not_mixed_in(copy):
+    with pytest.raises(data.DataError, match="seed"):
+        data.start(copy, OPTIONS, SEED + 1)
+    with pytest.raises(data.DataError, match="config"):
+        data.start(copy, dataclasses.replace(OPTIONS, train=3), SEED)
+    data.start(copy, OPTIONS, SEED)
+    manifest = json.loads((copy / "manifest.json").read_text())
+    (copy / "manifest.json").write_text(json.dumps(manifest | {"format": 99}))
+    with pytest.raises(data.DataError, match="format 99"):
+        data.load(copy)
+
+
+def test_options_that_do_not_fit_are_refused():
+    with pytest.raises(ValueError, match="multiple of shard"):
+        data.DataConfig(SMALL, train=3, test=2, shard=2)
+    with pytest.raises(ValueError, match="multiple of 4"):
+        dataclasses.replace(SMALL, size=50)
+    with pytest.raises(ValueError, match="stamps"):
+        dataclasses.replace(SMALL, stamps=2)
+
+
+def test_long_strokes_fit_their_stamps():
+    for k in range(12):
+        plan = pairs.draw(SMALL, jax.random.key(k))
+        position = np.asarray(plan.stroke.position)[np.asarray(plan.stroke.valid)]
+        step = np.hypot(*np.diff(position, axis=0).T)
+        assert step.max() <= SMALL.paint.pixel * 1.1
+        assert np.isclose(float(plan.mix.sum()), 1.0) and 0.0 < float(plan.load) <= 1.0
