@@ -44,6 +44,14 @@ class Pairs:
         return jax.tree.map(lambda x: x[index], self)
 
     @property
+    def nbytes(self) -> int:
+        return sum(x.nbytes for x in jax.tree.leaves(self.batch))
+
+    def take(self, index) -> Batch:
+        """The pairs of these numbers, on the host."""
+        return jax.tree.map(lambda x: np.asarray(x)[index], self.batch)
+
+    @property
     def background(self):
         return self.batch.inputs[..., : self.batch.target.shape[-1]]
 

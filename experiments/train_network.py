@@ -5,6 +5,7 @@ import sys
 from pathlib import Path
 from typing import Literal
 
+import jax
 import numpy as np
 
 from experiments import make_dataset, training
@@ -33,15 +34,42 @@ class Config(training.Options):
     """Color: with the new height (paper Figure 5)."""
 
 
+@dataclasses.dataclass(frozen=True)
+class Stored:
+    """Pairs that stay on disk until they are taken; what `training.run` learns from."""
+
+    found: data.Dataset
+    index: np.ndarray
+    kind: str
+    options: Config
+
+    def __len__(self):
+        return len(self.index)
+
+    @property
+    def nbytes(self) -> int:
+        one = self.take(np.arange(1))
+        return len(self) * sum(x.nbytes for x in jax.tree.leaves(one))
+
+    def take(self, index):
+        raw = self.found.take("train", self.index[index])
+        return jax.device_get(batch_of(raw, self.kind, self.options))
+
+
+def batch_of(raw: dict, kind: str, options: Config):
+    """Inputs, target and mask of a network, as the options ask for."""
+    if kind == "height":
+        return data.height_batch(raw, options.sweeps)
+    return data.color_batch(raw, options.time, options.height)
+
+
 def pairs_of(found: data.Dataset, split: str, index, kind: str, options: Config) -> Pairs:
     """Pairs of a data set in network scale."""
     raw = found.take(split, index)
     shown = data.preview(raw)
-    if kind == "height":
-        batch = data.height_batch(raw, options.sweeps)
-        return Pairs(batch, data.network_height(shown["new_height"]))
-    batch = data.color_batch(raw, options.time, options.height)
-    return Pairs(batch, 2.0 * shown["new_color"] - 1.0)
+    height = kind == "height"
+    preview = data.network_height(shown["new_height"]) if height else 2.0 * shown["new_color"] - 1.0
+    return Pairs(batch_of(raw, kind, options), preview)
 
 
 def main(kind: str, options: Config) -> None:
@@ -63,7 +91,7 @@ def main(kind: str, options: Config) -> None:
         training.fit(
             options,
             kind,
-            take("train", numbers[:-held]),
+            Stored(found, numbers[:-held], kind, options),
             take("train", numbers[-held:]),
             take("test", np.arange(tests)),
             scale,

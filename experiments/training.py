@@ -110,10 +110,8 @@ def make_batches(pairs: Pairs, options: Options):
     """`batches(step) -> (Batch on the device, numbers of its pairs)`; the same whether all pairs
     are on the device or not."""
     device = jax.devices()[0]
-    size = sum(x.nbytes for x in jax.tree.leaves(pairs.batch))
-    resident = size <= options.resident * 1e9
-    where = jax.device_put if resident else jax.device_get
-    data = where(pairs.batch, device) if resident else where(pairs.batch)
+    resident = pairs.nbytes <= options.resident * 1e9
+    data = jax.device_put(pairs.take(np.arange(len(pairs))), device) if resident else None
     gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
     # The paint knows no direction, so every pair is worth eight.
     turn = jax.jit(turned)
@@ -123,7 +121,7 @@ def make_batches(pairs: Pairs, options: Options):
         if resident:
             found = gather(data, jax.device_put(index, device))
         else:
-            found = jax.device_put(jax.tree.map(lambda x: x[index], data), device)
+            found = jax.device_put(pairs.take(index), device)
         if options.turns:
             which = np.random.default_rng((options.seed, step)).integers(8)
             found = turn(found, jax.device_put(np.int32(which), device))
@@ -177,7 +175,7 @@ class _Log:
 
 def _start(init, params, pairs: Pairs, options: Options, checkpoints):
     """(state, notes): from the last checkpoint that can be read, or new."""
-    few = jax.tree.map(lambda x: jnp.asarray(x[: options.batch]), pairs.batch)
+    few = jax.tree.map(jnp.asarray, pairs.take(np.arange(options.batch)))
     key = jax.random.key(options.seed)
     notes = {"seed": options.seed, "batch": options.batch, "pairs": len(pairs)}
     folder = checkpoints.directory
@@ -286,7 +284,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
                 check()
         checkpoints.wait_until_finished()
         log.file.close()
-        few = jax.tree.map(lambda x: jnp.asarray(x[: options.batch]), train.batch)
+        few = jax.tree.map(jnp.asarray, train.take(np.arange(options.batch)))
         abstract = jax.eval_shape(init, jax.random.key(0), few, params)
         best = checkpoint.restore(checkpoints, abstract, best=True)
         best = state if best is None else best.state

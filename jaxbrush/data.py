@@ -44,7 +44,7 @@ class DataConfig:
     canvases a file holds."""
 
     pairs: PairConfig = PairConfig()  # noqa: RUF009
-    train: int = 40
+    train: int = 12
     test: int = 4
     shard: int = 2
 
@@ -72,7 +72,7 @@ PRESETS = {
         PairConfig(size=512, strokes=5, stamps=512, bristles=256), train=2000, test=200, shard=5
     ),
 }
-"""tiny: 160 + 16 pairs of 128 x 128. small: 1,000 + 125 of 256 x 256. paper: 10,000 + 1,000 of
+"""tiny: 48 + 16 pairs of 128 x 128. small: 1,000 + 125 of 256 x 256. paper: 10,000 + 1,000 of
 512 x 512, as many as the paper's."""
 
 
