@@ -4,9 +4,7 @@ The numbers are of `python -m experiments.paint_accuracy`: 9 mm of a 4.5 mm flat
 band, against `reference`; times are CPU time on one core.
 """
 
-import dataclasses
-
-from jaxbrush.paint.state import PaintConfig, PaintParams, make_params
+from jaxbrush.paint.state import PaintConfig, PaintParams, for_brush, make_params
 
 REAL = 260
 """Bristles of the brush that the default constants are for."""
@@ -15,13 +13,7 @@ REAL = 260
 def params_of(bristles: int = REAL) -> PaintParams:
     """The default constants, for a brush of so many bristles: fewer are thicker, so that they fill
     the same share of the paint, under a coat of the same thickness."""
-    scale, params = (REAL / bristles) ** 0.5, make_params()
-    return dataclasses.replace(
-        params,
-        hair_radius=params.hair_radius * scale,
-        coat_dry=params.coat_dry / scale,
-        coat_full=params.coat_full / scale,
-    )
+    return for_brush(make_params(), 4.5, 1.4, bristles)
 
 
 def offline(bristles: int = REAL) -> tuple[PaintConfig, PaintParams, float]:
