@@ -100,7 +100,7 @@ def draw_palette(key, pigments: int):
     # From HSV; saturation falls off for the lightest.
     value = 0.08 + 0.87 * value
     chroma = 0.95 * chroma * (1.0 - 0.5 * value**3)
-    wheel = jnp.abs(jnp.mod(6.0 * hue[:, None] + jnp.array([0.0, 4.0, 2.0])[None], 6.0) - 3.0) - 1.0
+    wheel = jnp.abs(jnp.mod(6.0 * hue[:, None] + jnp.array([[0.0, 4.0, 2.0]]), 6.0) - 3.0) - 1.0
     return from_srgb(value[:, None] * (1.0 - chroma[:, None] * (1.0 - jnp.clip(wheel, 0.0, 1.0))))
 
 
@@ -172,7 +172,7 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
     """
     track = rollout(options.brush, plan.brush, plan.stroke)
     edge = MARGIN * options.paint.pixel
-    shift = jnp.asarray([edge, edge, 0.0], track.position.dtype)[:, None]
+    shift = jnp.asarray([edge, edge, 0.0], track.position.dtype)[None, None, :, None]
     moved = dataclasses.replace(track, position=track.position + shift)
     loaded: BrushPaint = load_brush(
         options.paint, plan.paint, options.bristles, plan.load, plan.mix

@@ -131,9 +131,10 @@ def test_options_that_do_not_fit_are_refused():
 
 
 def test_long_strokes_fit_their_stamps():
+    options = pairs.PairConfig()
     for k in range(12):
-        plan = pairs.draw(SMALL, jax.random.key(k))
+        plan = pairs.draw(options, jax.random.key(k))
         position = np.asarray(plan.stroke.position)[np.asarray(plan.stroke.valid)]
         step = np.hypot(*np.diff(position, axis=0).T)
-        assert step.max() <= SMALL.paint.pixel * 1.1
+        assert step.max() <= options.paint.pixel * 1.01
         assert np.isclose(float(plan.mix.sum()), 1.0) and 0.0 < float(plan.load) <= 1.0
