@@ -14,9 +14,8 @@ from jaxbrush.train import Batch, weights_of
 
 TOGETHER = 4  # pairs evaluated at once
 COLUMNS = {
-    "height": ("whole", "in mask", "whole, [0, 1]", "in mask, [0, 1]", "volume %", "normal °"),
-    "color": ("whole", "in mask", "whole, [0, 1]", "in mask, [0, 1]", "ΔE mean", "ΔE p95",
-              "out of hull %"),
+    "height": ("whole", "mask", "whole [0,1]", "mask [0,1]", "volume %", "normal °"),
+    "color": ("whole", "mask", "whole [0,1]", "mask [0,1]", "ΔE", "ΔE p95", "off hull %"),
 }  # fmt: skip
 
 
@@ -172,7 +171,8 @@ def compare(kind: str, found, pairs: Pairs, scale: Scale) -> dict[str, dict]:
 
 
 def table(kind: str, rows: dict[str, dict]) -> tuple[list[str], list[list[str]]]:
-    """Columns and rows of what `compare` found, as text."""
+    """Columns and rows of what `compare` found, as text; of the spectrum the three finest octaves,
+    power over the true one."""
     measures = ["rmse_whole", "rmse_masked", "rmse_whole_image", "rmse_masked_image"]
     texts = []
     for name, row in rows.items():
@@ -182,5 +182,5 @@ def table(kind: str, rows: dict[str, dict]) -> tuple[list[str], list[list[str]]]
         else:
             text += [f"{row['delta_e']:.2f}", f"{row['delta_e_p95']:.2f}"]
             text += [f"{100 * row['out_of_hull']:.2f}"]
-        texts.append(text + [" ".join(f"{x:.2f}" for x in row["spectrum"])])
-    return ["RMSE", *COLUMNS[kind], "power by octave"], texts
+        texts.append(text + [" ".join(f"{x:.1f}" for x in row["spectrum"][:3])])
+    return ["RMSE", *COLUMNS[kind], "fine power"], texts
