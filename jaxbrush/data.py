@@ -297,8 +297,9 @@ def color_batch(pairs: dict, time: bool = True, height: bool = True) -> Batch:
     )
 
 
-PREVIEW_FILM = 0.16
-"""[mm] that the preview lays: median of strokes on bare canvas in the tiny data set."""
+PREVIEW_FILM = 0.227
+"""[mm] that the preview lays: median where bristles came over bare canvas, in the 48 training pairs
+of the tiny data set, seed 0."""
 
 
 def preview(pairs: dict) -> dict[str, jax.Array]:
