@@ -22,7 +22,7 @@ from; the test split is seen once, at the end."""
 class Config(training.Options):
     """Trains a network on a data set, which is made first if it is not there."""
 
-    preset: Literal["tiny", "small", "paper"] = "tiny"
+    preset: Literal["tiny", "cpu", "small", "paper"] = "tiny"
     """Data set (see make_dataset)."""
     data: Path | None = None
     """Folder of the data set [default: results/data_<preset>]."""
@@ -96,6 +96,7 @@ def main(kind: str, options: Config) -> None:
             take("test", np.arange(tests)),
             scale,
             data=about,
+            inputs={"sweeps": options.sweeps, "time": options.time, "height": options.height},
             command=f"python -m experiments.train_{kind} {' '.join(sys.argv[1:])}".strip(),
         )
     except (ValueError, training.NotFinite) as error:

@@ -55,6 +55,8 @@ class Options:
     """Adam's learning rate of the generator."""
     discriminator_rate: float = 2e-4
     """Adam's learning rate of the discriminator."""
+    fall: float = 0.5
+    """Share of the run, of its steps or minutes, in which both rates fall to 0 at its end."""
     average: bool = False
     """Evaluates and exports a running average of the parameters."""
     check_every: int = 200
@@ -71,6 +73,16 @@ class Options:
 
 class NotFinite(RuntimeError):
     """A training that produced something that is not finite; says where to go on from."""
+
+
+RUNGS = 64
+"""The falling rates change so many times: an update's parameters need not travel every time."""
+
+
+def falling(fall: float, spent: float) -> float:
+    """Factor on the learning rates when a share of the run is spent, in steps of 1 / `RUNGS`."""
+    rung = np.floor(RUNGS * min(spent, 1.0)) / RUNGS
+    return float(np.clip((1.0 - rung) / max(fall, 1e-9), 0.5 / RUNGS, 1.0))
 
 
 def train_config(options: Options, kind: str) -> TrainConfig:
@@ -225,8 +237,12 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
     with checkpoint.opened(folder / "checkpoints", chosen) as checkpoints:
         state, notes = _start(init, params, train, options, checkpoints)
         step = first = int(jax.device_get(state.step))
+        used = 1.0  # factor on the rates
         log = _Log(folder / "metrics.jsonl", options.log_every, step)
         pending = None  # metrics of the update before: read late, so that the device never waits
+
+        def spent(step):
+            return max((time.perf_counter() - began) / seconds, step / last_step)
 
         def read(pending, bar, task):
             at, index, metrics = pending
@@ -244,8 +260,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
             text = " ".join(
                 f"{k} {metrics[k]:.3f}" for k in ("l1", "gan", "accuracy") if k in metrics
             )
-            spent = max((time.perf_counter() - began) / seconds, (at + 1) / last_step)
-            bar.update(task, completed=min(spent, 1.0), text=f"step {at + 1}  {text}")
+            bar.update(task, completed=min(spent(at + 1), 1.0), text=f"step {at + 1}  {text}")
 
         def check():
             variables = inference_variables(state)
@@ -265,6 +280,12 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
             looped = time.perf_counter()
             while step < last_step and time.perf_counter() - began < seconds:
                 batch, index = batches(step)
+                factor = falling(options.fall, spent(step))
+                if factor != used:
+                    rates = (factor * options.rate, factor * options.discriminator_rate)
+                    slower = make_params(options.l1, options.gan, *rates)
+                    slower = jax.device_put(slower, jax.devices()[0])
+                    state, used = dataclasses.replace(state, params=slower), factor
                 state, metrics = update(state, batch)
                 if pending is not None:
                     read(pending, bar, task)
@@ -299,7 +320,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
 
 def fit(
     options: Options, kind: str, train: Pairs, held: Pairs, test: Pairs, scale: Scale,
-    data: str = "", command: str = "",
+    data: str = "", command: str = "", inputs: dict | None = None,
 ) -> dict:  # fmt: skip
     """Trains a network, compares it with the baselines on the test pairs, prints the table, and
     leaves in the folder: checkpoints/, samples/, metrics.jsonl, config.json, metrics.json, and the
@@ -307,7 +328,8 @@ def fit(
 
     Args:
       train, held, test: see `run`; no stroke is in two of them.
-      scale: of heights and pixels. data, command: for the card.
+      scale: of heights and pixels. data, command, inputs: for the card; from the last, `evaluate`
+        knows what the network is given.
 
     Returns:
       What metrics.json holds: numbers of the run and, under "errors", those of `compare`.
@@ -324,6 +346,7 @@ def fit(
     card = {
         "command": command,
         "data": data,
+        "inputs": inputs or {},
         "pairs": f"{len(train)} for training, {len(test)} for the errors",
         "steps": numbers["best_step"],
         "device": f"{jax.devices()[0]}, {os.cpu_count()} cores",

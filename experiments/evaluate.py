@@ -1,0 +1,114 @@
+"""Errors of exported networks on the test pairs of a data set, beside the baselines.
+
+python -m experiments.evaluate                                # what ships in checkpoints/
+python -m experiments.evaluate --weights results/train_height/height.npz --preset tiny
+python -m experiments.evaluate --weights checkpoints/color.npz --height checkpoints/height.npz
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import tyro
+
+from experiments import evaluation, make_dataset, train_network, training
+from experiments.common import print_table, results_folder, write_run
+from experiments.evaluation import Pairs, Scale
+from jaxbrush import checkpoint, data
+from jaxbrush.models import Generator
+
+KINDS = {1: "height", 3: "color"}
+SHIPPED = Path("checkpoints")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Compares networks with the simulator on pairs that they have not learned from."""
+
+    weights: tuple[Path, ...] = (SHIPPED / "height.npz", SHIPPED / "color.npz")
+    """Exported networks, of height or color."""
+    height: Path | None = None
+    """A height network whose picture the color networks are given in place of the true height, as
+    in use."""
+    preset: Literal["tiny", "cpu", "small", "paper"] = "tiny"
+    """Data set, made if it is not there."""
+    data: Path | None = None
+    """Folder of the data set [default: results/data_<preset>]."""
+    split: Literal["test", "train"] = "test"
+    """Pairs to judge by."""
+    out: Path | None = None
+    """Folder for pictures and numbers [default: results/evaluate]."""
+
+
+def predicted(exported: checkpoint.Exported, pairs: Pairs) -> np.ndarray:
+    """Pictures of a network for all pairs, (n, h, w, k) in network scale."""
+    return evaluation.paint(exported.config, exported.variables, pairs.batch)
+
+
+def with_height(pairs: Pairs, height) -> Pairs:
+    """Color pairs whose last input, the new height, is another one, (n, h, w, 1)."""
+    inputs = np.concatenate([np.asarray(pairs.batch.inputs)[..., :-1], height], -1)
+    return Pairs(dataclasses.replace(pairs.batch, inputs=jnp.asarray(inputs)), pairs.preview)
+
+
+def milliseconds(exported: checkpoint.Exported, size: int) -> float:
+    """Least time of one picture of size x size, warm."""
+    channels = exported.variables["params"]["encode1"]["kernel"].shape[2]
+    call = jax.jit(lambda v, x: Generator(exported.config).apply(v, x, x[..., :1]))
+    x = jnp.zeros((1, size, size, channels))
+    times = []
+    for _ in range(6):
+        start = time.perf_counter()
+        jax.block_until_ready(call(exported.variables, x))
+        times.append(time.perf_counter() - start)
+    return 1e3 * min(times)
+
+
+def main(options: Config) -> None:
+    missing = [str(p) for p in (*options.weights, options.height) if p and not p.exists()]
+    if missing:
+        raise SystemExit(f"no such weights: {', '.join(missing)}")
+    try:
+        networks = [(path, checkpoint.load(path)) for path in options.weights]
+        chained = options.height and checkpoint.load(options.height)
+        found = data.load(make_dataset.build(options.preset, options.data))
+    except ValueError as error:
+        raise SystemExit(f"{error}") from error
+    folder = results_folder("evaluate", options.out)
+    index = np.arange(found.count(options.split))
+    scale = Scale(data.LEVELS["height"], found.options.pairs.paint.pixel)
+    results = {}
+    for path, exported in networks:
+        kind = KINDS[exported.config.outputs]
+        seen = train_network.Config(**exported.card.get("inputs", {}))
+        pairs = train_network.pairs_of(found, options.split, index, kind, seen)
+        rows = evaluation.compare(kind, predicted(exported, pairs), pairs, scale)
+        if kind == "color" and chained and seen.height:
+            shape = train_network.Config(**chained.card.get("inputs", {}))
+            heights = train_network.pairs_of(found, options.split, index, "height", shape)
+            used = with_height(pairs, predicted(chained, heights))
+            picture = predicted(exported, used)
+            rows = {
+                "on predicted height": evaluation.errors(kind, picture, used.batch, scale)
+            } | rows
+        training.sample_grid(
+            kind, predicted(exported, pairs[:6]), pairs[:6], folder / f"{path.stem}.png"
+        )
+        spent = milliseconds(exported, found.options.pairs.size)
+        results[str(path)] = {"errors": rows, "milliseconds": spent}
+        names, texts = evaluation.table(kind, rows)
+        side = found.options.pairs.size
+        print_table(
+            f"{path}: {len(index)} {options.split} pairs, {spent:.0f} ms for {side} x {side}",
+            names,
+            texts,
+        )
+    write_run(folder, options, results)
+
+
+if __name__ == "__main__":
+    main(tyro.cli(Config, description=__doc__))
