@@ -6,7 +6,9 @@ import jax
 import numpy as np
 
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush
+from jaxbrush.canvas import mix_subtractive
 from jaxbrush.paint import PaintParams, for_brush, make_params
+from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent
 from jaxbrush.stylus import Stroke, make_stroke, resample
 
 PALETTE = {
@@ -47,6 +49,11 @@ def hand(corners, pressure: float, pixel: float, depth: float, fall: float = 0.1
       corners: (n, 2) [mm]. depth: way of the handle at pressure 1 [mm]. fall: share of the stroke
         over which it is lifted.
     """
+    return resample(drawn(corners, pressure, fall), STAMPS, pixel, np.inf, depth)
+
+
+def drawn(corners, pressure: float, fall: float = 0.15) -> Stroke:
+    """The stroke of `hand` before it is resampled."""
     corners = np.asarray(corners, float)
     u = np.linspace(0.0, 1.0, 400)
     at = np.linspace(0.0, 1.0, len(corners))
@@ -59,9 +66,8 @@ def hand(corners, pressure: float, pixel: float, depth: float, fall: float = 0.1
     press = pressure * np.clip(np.minimum(share / 0.12, (1.0 - share) / fall), 0.0, 1.0)
     heading = np.arctan2(*(path[-1] - path[0])[::-1])
     # The brush leans into the stroke, its broad side across.
-    stroke = make_stroke(path, way / SPEED, press, altitude=np.radians(50.0), azimuth=heading,
-                         twist=heading - 0.5 * np.pi)  # fmt: skip
-    return resample(stroke, STAMPS, pixel, np.inf, depth)
+    return make_stroke(path, way / SPEED, press, altitude=np.radians(50.0), azimuth=heading,
+                       twist=heading - 0.5 * np.pi)  # fmt: skip
 
 
 def brush_of(name: str, config: BrushConfig) -> tuple[BrushParams, PaintParams, float]:
@@ -163,3 +169,43 @@ SCENES = {
     "strokes": ((256, 576), _pressures), "layers": ((256, 528), _layers), "sea": ((264, 352), _sea)
 }  # fmt: skip
 """Size [pixels] and strokes of each sheet."""
+
+
+# shape, width, thickness, length, press depth [mm]: brushes such as the networks learned from
+_RECORDED = {
+    "flat": ("flat", 3.8, 1.14, 17.4, 4.35), "small flat": ("flat", 2.4, 0.75, 13.2, 3.3),
+    "round": ("round", 2.2, 2.2, 12.6, 3.15), "rigger": ("round", 1.4, 1.4, 10.2, 2.55),
+}  # fmt: skip
+_FIELDS = ("shape", "width", "thickness", "length", "depth")
+RATE = 125.0
+"""Samples a second of a recorded pen."""
+
+
+def recorded(scene: str = "sea") -> Session:
+    """A scene as a session that a painter might have recorded: brushes, colors, pen samples.
+
+    The brush is dipped before every stroke, as full as the scene says.
+    """
+    shape, touches = SCENES[scene]
+    events, seen = [], None
+    for touch in touches():
+        brush = dict(zip(_FIELDS, _RECORDED[touch.brush], strict=True)) | {"load": touch.load}
+        if brush != seen:
+            events.append(BrushEvent(brush))
+            seen = brush
+        share = np.asarray([touch.color.get(name, 0.0) for name in NAMES], np.float32)
+        rgb = mix_subtractive(share, np.asarray(list(PALETTE.values()), np.float32))
+        events.append(ColorEvent(tuple(round(float(c), 4) for c in rgb)))
+        pen = drawn(touch.corners, touch.pressure, touch.fall)
+        t = np.arange(0.0, float(pen.time[-1]) + 1.0 / RATE, 1.0 / RATE)
+        at = lambda x, t=t, pen=pen: tuple(  # noqa: E731
+            np.interp(t, np.asarray(pen.time), np.asarray(x, float)).round(4).tolist()
+        )
+        events.append(
+            StrokeEvent(
+                t=tuple(t.round(4).tolist()), x=at(pen.position[:, 0]), y=at(pen.position[:, 1]),
+                pressure=at(pen.pressure), altitude=at(pen.altitude), azimuth=at(pen.azimuth),
+                twist=at(pen.twist),
+            )
+        )  # fmt: skip
+    return Session((shape[1] * 0.125, shape[0] * 0.125), 1.0, tuple(events))

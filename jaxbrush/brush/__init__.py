@@ -2,7 +2,7 @@
 
 from jaxbrush.brush.contact import Contact, Surface
 from jaxbrush.brush.forces import stable_dt
-from jaxbrush.brush.rollout import BristleTrack, rollout
+from jaxbrush.brush.rollout import BristleTrack, advance, begin, rollout
 from jaxbrush.brush.shapes import SHAPES, BrushConfig, BrushParams, make_brush
 
 __all__ = [
@@ -12,6 +12,8 @@ __all__ = [
     "BrushParams",
     "Contact",
     "Surface",
+    "advance",
+    "begin",
     "make_brush",
     "rollout",
     "stable_dt",

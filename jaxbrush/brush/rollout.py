@@ -134,30 +134,34 @@ def _between(track, stroke, handle, solved, stride):
     )
 
 
-def _solve(config, params, stroke, pose, surface):
-    by_force = config.press == "force"
-    first = jax.tree.map(lambda x: x[0], pose)
-    load = params.press_force * stroke.pressure.astype(params.length.dtype)
-    load = jnp.concatenate([jnp.zeros(config.approach, load.dtype), load])
+def _project(config, params, start, pose, load, surface):
+    """Scans the fast integrators over poses. Returns (state, what each stamp saw)."""
+    factor = None
+    if config.integrator == "projective":
+        factor = jax.vmap(lambda dt: projective.dynamic_inverse_factor(config, params, dt))(pose.dt)
+    constant = projective.inverse_factor(config.segments)
 
+    def body(carry, inputs):
+        pose, q, force = inputs
+        q = constant if q is None else q
+        target = force if config.press == "force" else None
+        carry, contact = projective.step(config, params, carry, pose, q, target, surface)
+        return carry, (contact.position, contact.force[2], contact.reaction)
+
+    return jax.lax.scan(body, start, (pose, factor, load))
+
+
+def _load(params, stroke, approach: int):
+    load = params.press_force * stroke.pressure.astype(params.length.dtype)
+    return jnp.concatenate([jnp.zeros(approach, load.dtype), load])
+
+
+def _solve(config, params, stroke, pose, surface):
+    first = jax.tree.map(lambda x: x[0], pose)
     if config.integrator in ("quasi_static", "projective"):
         start = projective.init(config, params, first)
-        if config.integrator == "projective":
-            factor = jax.vmap(lambda dt: projective.dynamic_inverse_factor(config, params, dt))(
-                pose.dt
-            )
-        else:
-            factor = None
-        constant = projective.inverse_factor(config.segments)
-
-        def body(carry, inputs):
-            pose, q, force = inputs
-            q = constant if q is None else q
-            target = force if by_force else None
-            carry, contact = projective.step(config, params, carry, pose, q, target, surface)
-            return carry, (contact.position, contact.force[2], contact.reaction)
-
-        _, seen = jax.lax.scan(body, start, (pose, factor, load))
+        load = _load(params, stroke, config.approach)
+        _, seen = _project(config, params, start, pose, load, surface)
     else:
         module = implicit if config.integrator == "implicit_euler" else explicit
         start = module.init(config, params, first)
@@ -168,13 +172,77 @@ def _solve(config, params, stroke, pose, surface):
 
         _, seen = jax.lax.scan(body, start, pose)
 
-    k = config.approach
+    return _track(stroke, jax.tree.map(lambda x: x[config.approach :], seen))
+
+
+def _track(stroke, seen):
     position, force, reaction = seen
     above = position.shape[1] - force.shape[1]
     return BristleTrack(
         time=stroke.time,
-        position=position[k:],
-        force=jnp.pad(force[k:], ((0, 0), (above, 0), (0, 0))),
-        reaction=reaction[k:],
+        position=position,
+        force=jnp.pad(force, ((0, 0), (above, 0), (0, 0))),
+        reaction=reaction,
         valid=stroke.valid,
     )
+
+
+@state
+class Motion:
+    """A stroke that is still being drawn. bristles: at its last stamp. seen: position, force and
+    reaction there."""
+
+    bristles: projective.ProjectiveState
+    seen: tuple
+
+
+def begin(config: BrushConfig, params: BrushParams, stroke: Stroke) -> Motion:
+    """Lowers a brush onto the first stamp of a stroke, to go on by `advance`. Pure.
+
+    Raises:
+      ValueError: an integrator other than "quasi_static", or guides.
+    """
+    _check(config, params, stroke)
+    if config.integrator != "quasi_static" or config.guides:
+        raise ValueError(
+            f"integrator = {config.integrator!r}, guides = {config.guides}: expected "
+            "'quasi_static' without guides for a stroke in pieces"
+        )
+    first = jax.tree.map(lambda x: x[:1], stroke)
+    pose = poses(params, first, config.approach, config.press == "depth")
+    start = projective.init(config, params, jax.tree.map(lambda x: x[0], pose))
+    load = _load(params, first, config.approach)
+    bristles, seen = _project(config, params, start, pose, load, None)
+    return Motion(bristles=bristles, seen=jax.tree.map(lambda x: x[-1], seen))
+
+
+def advance(
+    config: BrushConfig, params: BrushParams, motion: Motion, stroke: Stroke
+) -> tuple[BristleTrack, Motion]:
+    """Moves a brush along the next piece of a stroke. Pure; costs what the piece costs.
+
+    Pieces of t stamps, t - 1 a multiple of `config.solve_stride`, give the track of `rollout`.
+
+    Args:
+      motion: from `begin`, or from the piece before.
+      stroke: t >= 2 stamps, the first of which is the last of the piece before. Where the last are
+        padding, the motion that is returned is of no use.
+
+    Returns:
+      (BristleTrack of the t stamps, Motion).
+    """
+    _check(config, params, stroke)
+    stamps, press = stroke.time.shape[0], config.press == "depth"
+    solved = solved_stamps(stamps, config.solve_stride)
+    few = jax.tree.map(lambda x: x[solved], stroke)
+    pose = jax.tree.map(lambda x: x[1:], poses(params, few, 0, press))
+    bristles, seen = _project(
+        config, params, motion.bristles, pose, _load(params, few, 0)[1:], None
+    )
+    last = jax.tree.map(lambda x: x[-1], seen)
+    seen = jax.tree.map(lambda a, b: jnp.concatenate([a[None], b]), motion.seen, seen)
+    track = _track(few, seen)
+    if len(solved) < stamps:
+        handle = poses(params, stroke, 0, press).origin[:, :2]
+        track = _between(track, stroke, handle, solved, config.solve_stride)
+    return track, Motion(bristles=bristles, seen=last)

@@ -17,8 +17,8 @@ import jax
 import jax.numpy as jnp
 
 from jaxbrush.paint.advection import advect, repack
-from jaxbrush.paint.hair import Hair, corners, hair
-from jaxbrush.paint.rollout import PaintReport
+from jaxbrush.paint.hair import Hair, corners
+from jaxbrush.paint.rollout import paint_stroke
 from jaxbrush.paint.solvers import Matrix, residual, solve
 from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams
 from jaxbrush.paint.stencil import inner_x, inner_y, near, stored, wide
@@ -242,64 +242,13 @@ def heightfield_stroke(
       and the upper film [mm].
 
     Returns:
-      (canvas, brush, PaintReport), `fullest` being the greatest thickness in the window [mm].
+      (canvas, brush, PaintReport), `fullest` being the thickest lower film [mm].
 
     Raises:
       ValueError: shapes that do not fit.
     """
-    layers, k, h, w = canvas.shape
     if (config.layers, config.layer) != (2, 1.0):
         raise ValueError(
             f"config of {config.layers} layers of {config.layer} mm: expected 2 films of 1.0 mm"
         )
-    if (k, layers) != (config.pigments, 2) or min(h, w) < config.window:
-        raise ValueError(
-            f"canvas has shape {canvas.shape}: expected (2, {config.pigments}, y, x) "
-            f"with y, x >= config.window = {config.window}"
-        )
-    b = track.position.shape[-1]
-    if track.position.shape[1] < 2 or brush.tip.shape != (k, b):
-        raise ValueError(
-            f"track of {track.position.shape[1]} nodes and {b} bristles, brush.tip of shape "
-            f"{brush.tip.shape}: expected at least 2 nodes and {(k, b)}"
-        )
-    if tooth is None:
-        tooth = jnp.zeros((h, w), canvas.dtype)
-    # (t, 3, 2, b) with the tip last on the third axis
-    nodes = jnp.swapaxes(track.position[:, -2:].astype(canvas.dtype), 1, 2)
-    before = jnp.concatenate([nodes[:1], nodes[:-1]])
-    dt = jnp.concatenate([track.time[:1] * 0.0, track.time[1:] - track.time[:-1]])
-    size = config.window
-    middle = jnp.mean(nodes[:, :2, 1], axis=-1) / config.pixel
-    corner = jnp.round(middle - 0.5 * size)
-    corner = jnp.stack(
-        [jnp.clip(corner[:, 1], 0, h - size), jnp.clip(corner[:, 0], 0, w - size)], axis=1
-    ).astype(jnp.int32)
-
-    def body(carry, inputs):
-        canvas, brush = carry
-        a, b, dt, at, valid = inputs
-        y, x = at[0], at[1]
-        offset = jnp.stack([x, y, jnp.zeros_like(x)]).astype(canvas.dtype) * config.pixel
-        local = lambda n: jnp.swapaxes(n - offset[:, None, None], 0, 1)  # noqa: E731
-        active = jnp.where(valid, jnp.ones(b.shape[-1], canvas.dtype), 0.0)
-        points = hair(config, params, local(a), local(b), dt, active)
-        window = jax.lax.dynamic_slice(canvas, (0, 0, y, x), (2, k, size, size))
-        cloth = jax.lax.dynamic_slice(tooth, (y, x), (size, size))
-        painted, wet, residual = stamp(config, params, window, brush, points, cloth)
-        painted = jnp.where(valid, painted, window)
-        wet = jax.tree.map(lambda new, old: jnp.where(valid, new, old), wet, brush)
-        canvas = jax.lax.dynamic_update_slice(canvas, painted, (0, 0, y, x))
-        # Hair over the canvas's edge is not missed.
-        tip = local(b)[1]
-        edge = jnp.asarray([w, h], canvas.dtype) * config.pixel - offset[:2]
-        there = jnp.all((tip[:2] >= -offset[:2, None]) & (tip[:2] <= edge[:, None]), axis=0)
-        seen = jnp.all((tip[:2] >= 0.0) & (tip[:2] <= size * config.pixel), axis=0)
-        missed = jnp.any(there & ~seen & (tip[2] < config.layer))
-        thickest = jnp.max(jnp.sum(painted, axis=(0, 1)))
-        return (canvas, wet), (residual, thickest, ~missed | ~valid)
-
-    (canvas, brush), seen = jax.lax.scan(
-        body, (canvas, brush), (before, nodes, dt, corner, track.valid)
-    )
-    return canvas, brush, PaintReport(*seen)
+    return paint_stroke(config, params, canvas, brush, track, tooth, stamp)

@@ -59,8 +59,9 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
 
 
 def paint_stroke(
-    config: PaintConfig, params: PaintParams, canvas, brush: BrushPaint, track, tooth=None
-):
+    config: PaintConfig, params: PaintParams, canvas, brush: BrushPaint, track, tooth=None,
+    stamp=stamp,
+):  # fmt: skip
     """Paints one stroke.
 
     A pure function. Only a window around the brush is touched; the rest of the canvas stays
@@ -70,6 +71,7 @@ def paint_stroke(
       canvas: (z, k, y, x) pigment amounts. brush: paint of b bristles.
       track: BristleTrack of t stamps, with at least 2 nodes, on the same canvas coordinates [mm].
       tooth: (y, x) height of the weave [mm], or None for a smooth canvas.
+      stamp: what a stamp does on a window, with the arguments of `stamp`.
 
     Returns:
       (canvas, brush, PaintReport).
