@@ -163,8 +163,14 @@ def sheet(found: data.Dataset, path: Path) -> None:
 
 
 def build(preset: str, out: Path | None = None, seed: int = 0, workers: int = 0) -> Path:
-    """Makes a whole data set if it is not there; returns its folder."""
+    """Makes a whole data set if it is not there; returns its folder. A folder that is named and
+    holds a set of another make is taken as it is."""
     folder = folder_of(preset, out)
+    if out is not None and (folder / "manifest.json").exists():
+        try:
+            data.start(folder, data.PRESETS[preset], seed)
+        except data.DataError:
+            return folder
     make(folder, preset, seed, part_of(None, data.PRESETS[preset].shards), workers)
     return folder
 

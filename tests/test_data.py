@@ -7,7 +7,9 @@ import jax
 import numpy as np
 import pytest
 
-from jaxbrush import data, pairs
+from experiments import evaluate
+from jaxbrush import checkpoint, data, pairs
+from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.paint import PaintConfig
 
 SMALL = pairs.PairConfig(
@@ -138,3 +140,28 @@ def test_long_strokes_fit_their_stamps():
         step = np.hypot(*np.diff(position, axis=0).T)
         assert step.max() <= options.paint.pixel * 1.01
         assert np.isclose(float(plan.mix.sum()), 1.0) and 0.0 < float(plan.load) <= 1.0
+
+
+def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
+    weights = []
+    for kind, outputs, channels in (("height", 1, 2), ("color", 3, 8)):
+        options = GeneratorConfig(outputs, width=0.05)
+        variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, channels)))
+        weights.append(tmp_path / f"{kind}.npz")
+        checkpoint.export(weights[-1], options, variables, {"command": "a test"})
+    evaluate.main(evaluate.Config(tuple(weights), height=weights[0], data=folder, out=tmp_path))
+    found = json.loads((tmp_path / "metrics.json").read_text())
+    for path in weights:
+        rows = found[str(path)]["errors"]
+        assert rows["the simulator"]["rmse_masked"] == 0.0
+        # A network that has learned nothing paints gray.
+        assert rows["the network"]["rmse_whole"] > rows["copy the background"]["rmse_whole"]
+        assert (tmp_path / f"{path.stem}.png").stat().st_size > 500
+    color = found[str(weights[1])]["errors"]
+    assert color["on predicted height"]["delta_e"] != color["the network"]["delta_e"]
+    assert "2 test pairs" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="no such weights: .*absent.npz"):
+        evaluate.main(evaluate.Config((tmp_path / "absent.npz",), data=folder, out=tmp_path))
+    (tmp_path / "broken.npz").write_bytes(b"weights")
+    with pytest.raises(SystemExit, match="broken.npz"):
+        evaluate.main(evaluate.Config((tmp_path / "broken.npz",), data=folder, out=tmp_path))

@@ -1,0 +1,245 @@
+"""The engines that paint a session: the simulator as truth, its fastest setting, the networks.
+
+An engine is made once and paints deed by deed: `paint(deed) -> {stage: seconds}`, `canvas() ->
+Canvas`. A deed is one stroke with its brush, freshly loaded, and its color.
+"""
+
+import dataclasses
+import time
+from pathlib import Path
+
+import cv2
+import jax
+import jax.numpy as jnp
+import numpy as np
+from scipy.optimize import nnls
+
+from jaxbrush import data, painter
+from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
+from jaxbrush.canvas import Canvas, blank, flatten
+from jaxbrush.paint import (
+    PaintConfig,
+    PaintParams,
+    empty_canvas,
+    for_brush,
+    load_brush,
+    make_params,
+    paint_stroke,
+    presets,
+    weave,
+)
+from jaxbrush.raster.grid import bucket
+from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent, to_stroke
+from jaxbrush.stylus import Stroke, resample, stamps_needed, transform
+
+BRUSH = {
+    "shape": "flat", "width": 3.0, "thickness": 0.9, "length": 15.0, "depth": 3.75, "load": 0.85,
+    "bristles": 128, "seed": 0,
+}  # fmt: skip
+"""The brush of a session that names none; what a brush event may say. width, thickness, length of
+the ferrule and hair, depth at full pressure [mm]."""
+COLORS = ((0.02, 0.06, 0.30), (0.80, 0.16, 0.02), (0.85, 0.55, 0.04), (0.02, 0.25, 0.10))
+"""Taken in turn by strokes of a session that names no color, linear RGB."""
+EXPONENT = 0.35
+"""Of the mixture that `canvas.mix_subtractive` makes."""
+PIXEL = PaintConfig().pixel
+
+
+@dataclasses.dataclass(frozen=True)
+class Deed:
+    """One stroke to paint. stroke: raw samples [mm]. color: linear RGB of the load. load: share of
+    what the brush holds."""
+
+    stroke: Stroke
+    brush: BrushParams
+    paint: PaintParams
+    color: tuple[float, float, float]
+    load: float
+    bristles: int
+
+
+def brush_of(event: BrushEvent) -> tuple[BrushParams, PaintParams, dict]:
+    """What a brush event names.
+
+    Raises:
+      ValueError: a field that no brush has, or a shape that is none.
+    """
+    unknown = sorted(set(event.params) - set(BRUSH))
+    if unknown:
+        raise ValueError(f"brush event: {', '.join(unknown)}: expected fields among {list(BRUSH)}")
+    say = BRUSH | event.params
+    brush = make_brush(
+        jax.random.key(int(say["seed"])), BrushConfig(), say["shape"], int(say["bristles"]),
+        width=say["width"], thickness=say["thickness"], length=say["length"],
+        press_depth=say["depth"],
+    )  # fmt: skip
+    disc = say["shape"] in ("round", "rigger")
+    paint = for_brush(make_params(), say["width"], say["thickness"], int(say["bristles"]), disc)
+    return brush, paint, say
+
+
+def deeds_of(session: Session, shape) -> list[Deed]:
+    """The strokes of a session, scaled to fill a canvas of `shape` (h, w) pixels where the
+    session's own canvas has other sides."""
+    side = np.asarray(session.canvas)
+    factor = float(np.min(np.asarray(shape)[::-1] * PIXEL / side))
+    found, brush, color = [], brush_of(BrushEvent({})), None
+    for event in session.events:
+        if isinstance(event, BrushEvent):
+            brush = brush_of(event)
+        elif isinstance(event, ColorEvent):
+            color = tuple(event.rgb)
+        elif isinstance(event, StrokeEvent):
+            stroke = transform(to_stroke(session, event), scale=factor, center=(0.0, 0.0))
+            own = COLORS[len(found) % len(COLORS)] if color is None else color
+            params, paint, say = brush
+            found.append(Deed(stroke, params, paint, own, say["load"], int(say["bristles"])))
+    return found
+
+
+def _ratio(rgb):
+    reflectance = np.clip(np.asarray(rgb, float), 1e-3, 0.999)
+    return ((1.0 - reflectance) ** 2 / (2.0 * reflectance)) ** EXPONENT
+
+
+def shares(rgb, palette) -> np.ndarray:
+    """Shares of pigments (k, 3) whose subtractive mixture comes nearest to a color."""
+    # A heavy last row makes the shares sum to 1.
+    left = np.vstack([_ratio(palette).T, np.full(len(palette), 1e3)])
+    found, _ = nnls(left, np.append(_ratio(rgb), 1e3))
+    return found / found.sum()
+
+
+def palette_of(deeds, most: int = 6) -> np.ndarray:
+    """Pigments that the colors of all deeds can be mixed from, (k, 3): the colors farthest from
+    each other, by absorption."""
+    colors = np.unique(np.asarray([d.color for d in deeds]), axis=0)
+    place = _ratio(colors)
+    chosen = [int(np.argmax(np.linalg.norm(place - place.mean(0), axis=1)))]
+    while len(chosen) < min(most, len(colors)):
+        away = np.min(np.linalg.norm(place[:, None] - place[None, chosen], axis=-1), axis=1)
+        chosen.append(int(np.argmax(away)))
+    return colors[chosen]
+
+
+def _clock(stages: dict, name: str, call):
+    start = time.perf_counter()
+    out = jax.block_until_ready(call())
+    stages[name] = time.perf_counter() - start
+    return out
+
+
+def stamps_of(stroke: Stroke, spacing: float, depth) -> int:
+    """Bucketed number of stamps of a stroke."""
+    need = int(stamps_needed(stroke, spacing, np.inf, depth))
+    return bucket(max(2, need))
+
+
+class Simulator:
+    """The paint simulator as an engine."""
+
+    def __init__(self, config: PaintConfig, spacing: float, shape, palette, bristles: int | None):
+        self.config = dataclasses.replace(config, pigments=len(palette))
+        self.spacing, self.shape, self.palette = spacing, tuple(shape), jnp.asarray(palette)
+        self.bristles = bristles
+        # Strokes over the edge of what is kept must not pile up there.
+        self.margin = round(4.0 / config.pixel)
+        factor = config.pixel / PIXEL
+        inner = [int(np.ceil(n / factor)) for n in shape]
+        self.inside = tuple(slice(self.margin, self.margin + n) for n in inner)
+        size = tuple(n + 2 * self.margin for n in inner)
+        self.paint_canvas = empty_canvas(self.config, size)
+        self.tooth = jnp.asarray(weave(size, config.pixel), float)
+        self._move, self._lay = jax.jit(rollout, static_argnums=0), jax.jit(paint_stroke)
+
+    def paint(self, deed: Deed) -> dict[str, float]:
+        """Paints a stroke; seconds of each stage."""
+        stages = {}
+        brush, paint, count = deed.brush, deed.paint, deed.bristles
+        if self.bristles is not None and self.bristles < count:
+            brush, paint, count = fewer(deed, self.bristles)
+        edge = self.margin * self.config.pixel
+        moved = transform(deed.stroke, translate=(edge, edge))
+        stamps = stamps_of(deed.stroke, self.spacing, brush.press_depth)
+        track = _clock(stages, "brush", lambda: self._move(
+            BrushConfig(), brush, resample(moved, stamps, self.spacing, np.inf, brush.press_depth)
+        ))  # fmt: skip
+        loaded = load_brush(
+            self.config, paint, count, deed.load, shares(deed.color, np.asarray(self.palette))
+        )
+        self.paint_canvas, _, _ = _clock(stages, "paint", lambda: self._lay(
+            self.config, paint, self.paint_canvas, loaded, track, self.tooth
+        ))  # fmt: skip
+        return stages
+
+    def canvas(self) -> Canvas:
+        """What is seen, on the pixels of the session."""
+        rows, columns = self.inside
+        seen = flatten(
+            self.paint_canvas[:, :, rows, columns], self.config.layer, self.palette,
+            make_params().opacity, mixing="subtractive",
+        )  # fmt: skip
+        if self.config.pixel == PIXEL:
+            return seen
+        size = (self.shape[1], self.shape[0])
+        large = lambda x: cv2.resize(np.asarray(x), size, interpolation=cv2.INTER_CUBIC)  # noqa: E731
+        return Canvas(
+            height=jnp.maximum(large(seen.height), 0.0), color=jnp.clip(large(seen.color), 0.0, 1.0)
+        )
+
+
+def fewer(deed: Deed, count: int) -> tuple[BrushParams, PaintParams, int]:
+    """The brush of a deed with every n-th bristle only, thicker by as much."""
+    keep = np.linspace(0, deed.bristles - 1, count).round().astype(int)
+    take = lambda x: x[..., keep] if x.ndim and x.shape[-1] == deed.bristles else x  # noqa: E731
+    thicker = float(np.sqrt(deed.bristles / count))
+    paint = dataclasses.replace(
+        deed.paint, hair_radius=deed.paint.hair_radius * thicker,
+        coat_dry=deed.paint.coat_dry / thicker, coat_full=deed.paint.coat_full / thicker,
+    )  # fmt: skip
+    return jax.tree.map(take, deed.brush), paint, count
+
+
+class Neural:
+    """The networks as an engine."""
+
+    def __init__(self, options: painter.PainterConfig, nets: painter.Nets, shape):
+        self.options, self.nets = options, nets
+        self._canvas = blank(shape)
+
+    def paint(self, deed: Deed) -> dict[str, float]:
+        """Paints a stroke; seconds of each stage."""
+        stages, last = {}, [time.perf_counter()]
+
+        def watch(stage, value):
+            jax.block_until_ready(value)
+            now = time.perf_counter()
+            stages[stage], last[0] = now - last[0], now
+
+        self._canvas = painter.paint_stroke(
+            self.options, self.nets, self._canvas, deed.brush, np.asarray(deed.color, np.float32),
+            deed.stroke, donate=True, watch=watch,
+        )  # fmt: skip
+        return stages
+
+    def canvas(self) -> Canvas:
+        return jax.tree.map(jnp.copy, self._canvas)
+
+
+SHIPPED = (Path("checkpoints/height.npz"), Path("checkpoints/color.npz"))
+TAUGHT = dataclasses.replace(data.PRESETS["tiny"].pairs.paint, window=48)
+"""The simulator as the networks were taught by it, stamps a pixel apart."""
+
+
+def make(name: str, shape, deeds: list[Deed], weights=SHIPPED):
+    """An engine by name: "neural", "realtime" or "offline".
+
+    Raises:
+      ValueError, OSError: weights that are not there, or none.
+    """
+    if name == "neural":
+        return Neural(painter.PainterConfig(), painter.load_nets(*weights), shape)
+    if name == "offline":
+        return Simulator(TAUGHT, PIXEL, shape, palette_of(deeds), None)
+    config, _, spacing = presets.realtime()
+    return Simulator(config, spacing, shape, palette_of(deeds), presets.REAL // 4)
