@@ -9,6 +9,7 @@ python -m experiments.compare_engines --fast checkpoints/fast_height.npz checkpo
 import dataclasses
 from pathlib import Path
 
+import jax
 import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
@@ -35,6 +36,7 @@ MARKS = (1, 2, 4, 8, 16, 32, 64, 128)
 WHITES = 32
 """Strokes of white over white."""
 WHITE = (0.92, 0.90, 0.84)
+_delta_e = jax.jit(metrics.delta_e)
 TOUCHED = 0.005
 """Film from which a pixel counts as painted [mm]."""
 
@@ -99,7 +101,7 @@ def errors(found: Canvas, true: Canvas) -> dict:
     """Where either is painted: height [µm], color [ΔE CIEDE2000]."""
     there = (np.asarray(true.height) > TOUCHED) | (np.asarray(found.height) > TOUCHED)
     apart = np.asarray(found.height - true.height)[there]
-    color = np.asarray(metrics.delta_e(found.color, true.color))[there]
+    color = np.asarray(_delta_e(found.color, true.color))[there]
     return {"height": 1e3 * float(np.sqrt(np.mean(apart**2))), "color": float(np.mean(color))}
 
 
@@ -132,7 +134,7 @@ def tint(canvas: Canvas) -> float:
     """Mean ΔE from the white itself, where white lies thick."""
     thick = np.asarray(canvas.height) > 0.15
     white = jnp.broadcast_to(jnp.asarray(WHITE), canvas.color.shape)
-    return float(np.mean(np.asarray(metrics.delta_e(canvas.color, white))[thick]))
+    return float(np.mean(np.asarray(_delta_e(canvas.color, white))[thick]))
 
 
 def chart(options, canvases, results, tints, path: Path):
@@ -212,7 +214,7 @@ def main(options: Config) -> None:
             last[name] = canvases[len(deeds)]
             paint_session.save(folder / f"{name.replace(', ', '_').replace(' ', '_')}.png",
                                paint_session.lit(last[name]))  # fmt: skip
-        deeds = whites_of(options.whites, small)
+        session_deeds, deeds = deeds, whites_of(options.whites, small)
         names = [n for n in made if n in ("offline", "realtime") or n.startswith("neural")]
         task = progress.add_task("white over white", total=len(names) * len(deeds))
         for name in names:
@@ -222,7 +224,15 @@ def main(options: Config) -> None:
             paint_session.save(folder / f"white_{name.split(', ')[-1]}.png",
                                paint_session.lit(canvases[len(deeds)]))  # fmt: skip
     chart(options, last, results, tints, folder / "engines.png")
-    write_run(folder, options, {"engines": results, "white_over_white": tints})
+    took = 1e3 * engines.preview_times(
+        painter.PainterConfig(), painter.load_nets(*options.weights), shape, session_deeds
+    )
+    quantiles = dict(zip(("median", "p95", "p99", "worst"), np.percentile(took, (50, 95, 99, 100)),
+                         strict=True))  # fmt: skip
+    write_run(
+        folder, options,
+        {"engines": results, "white_over_white": tints, "preview_ms": quantiles},
+    )  # fmt: skip
     rows = []
     for name, row in results.items():
         error = row["errors"][max(row["errors"])]
@@ -238,6 +248,9 @@ def main(options: Config) -> None:
     for name in names:
         rows = [[stage, *row] for stage, row in results[name]["stages"].items()]
         print_table(f"{name}: ms a stroke", ["stage", "median", "95 %", "worst", "first"], rows)
+
+    text = ", ".join(f"{name} {value:.1f}" for name, value in quantiles.items())
+    console.print(f"Preview after the last sample of a frame, networks at work [ms]: {text}.")
 
 
 if __name__ == "__main__":

@@ -5,6 +5,7 @@ Canvas`. A deed is one stroke with its brush, freshly loaded, and its color.
 """
 
 import dataclasses
+import functools
 import time
 from pathlib import Path
 
@@ -30,6 +31,7 @@ from jaxbrush.paint import (
 )
 from jaxbrush.raster.grid import bucket
 from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent, to_stroke
+from jaxbrush.session import Session as Live
 from jaxbrush.stylus import Stroke, resample, stamps_needed, transform
 
 BRUSH = {
@@ -68,14 +70,17 @@ def brush_of(event: BrushEvent) -> tuple[BrushParams, PaintParams, dict]:
     if unknown:
         raise ValueError(f"brush event: {', '.join(unknown)}: expected fields among {list(BRUSH)}")
     say = BRUSH | event.params
+    return *_made(*(say[name] for name in BRUSH if name != "load")), say
+
+
+@functools.lru_cache(maxsize=64)
+def _made(shape, width, thickness, length, depth, bristles, seed):
     brush = make_brush(
-        jax.random.key(int(say["seed"])), BrushConfig(), say["shape"], int(say["bristles"]),
-        width=say["width"], thickness=say["thickness"], length=say["length"],
-        press_depth=say["depth"],
+        jax.random.key(int(seed)), BrushConfig(), shape, int(bristles), width=width,
+        thickness=thickness, length=length, press_depth=depth,
     )  # fmt: skip
-    disc = say["shape"] in ("round", "rigger")
-    paint = for_brush(make_params(), say["width"], say["thickness"], int(say["bristles"]), disc)
-    return brush, paint, say
+    disc = shape in ("round", "rigger")
+    return brush, for_brush(make_params(), width, thickness, int(bristles), disc)
 
 
 def deeds_of(session: Session, shape) -> list[Deed]:
@@ -83,6 +88,7 @@ def deeds_of(session: Session, shape) -> list[Deed]:
     session's own canvas has other sides."""
     side = np.asarray(session.canvas)
     factor = float(np.min(np.asarray(shape)[::-1] * PIXEL / side))
+    session = dataclasses.replace(session, scale=factor * session.scale)
     found, brush, color = [], brush_of(BrushEvent({})), None
     for event in session.events:
         if isinstance(event, BrushEvent):
@@ -90,7 +96,7 @@ def deeds_of(session: Session, shape) -> list[Deed]:
         elif isinstance(event, ColorEvent):
             color = tuple(event.rgb)
         elif isinstance(event, StrokeEvent):
-            stroke = transform(to_stroke(session, event), scale=factor, center=(0.0, 0.0))
+            stroke = to_stroke(session, event)
             own = COLORS[len(found) % len(COLORS)] if color is None else color
             params, paint, say = brush
             found.append(Deed(stroke, params, paint, own, say["load"], int(say["bristles"])))
@@ -224,6 +230,38 @@ class Neural:
 
     def canvas(self) -> Canvas:
         return jax.tree.map(jnp.copy, self._canvas)
+
+
+FRAME = 1.0 / 60.0
+"""Of a screen [s]."""
+
+
+def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, deeds) -> np.ndarray:
+    """Seconds from the last sample of each frame of 1/60 s to its preview, the networks at work on
+    the strokes before; every deed drawn twice, the first time to compile."""
+    took = []
+    with Live(options, nets, blank(shape)) as session:
+        for warm in (False, True):
+            for deed in deeds:
+                session.begin(deed.brush, deed.color)
+                pen = jax.tree.map(np.asarray, deed.stroke)
+                frame = np.floor((pen.time - pen.time[0]) / FRAME).astype(int)
+                for number in np.unique(frame):
+                    at = frame == number
+                    start = time.perf_counter()
+                    session.add(
+                        pen.time[at], *pen.position[at].T, pen.pressure[at], pen.altitude[at],
+                        pen.azimuth[at], pen.twist[at],
+                    )  # fmt: skip
+                    spent = time.perf_counter() - start
+                    if warm:
+                        took.append(spent)
+                        # As a hand would: the next samples are not there yet.
+                        time.sleep(max(0.0, FRAME - spent))
+                session.end()
+                session.poll()
+            session.wait()
+    return np.asarray(took)
 
 
 SHIPPED = (Path("checkpoints/height.npz"), Path("checkpoints/color.npz"))

@@ -31,15 +31,15 @@ class Options:
     """Folder for checkpoints, pictures and numbers [default: results/train_KIND]."""
     steps: int | None = None
     """Updates in all, those before a resume included."""
-    minutes: float | None = 10.0
+    minutes: float | None = 8.0
     """Time for training in this run, compilation included."""
     resume: bool = False
     """Goes on from the last checkpoint in the folder; without one, starts."""
     batch: int = 1
     """Pairs an update sees."""
-    width: float = 1.0
+    width: float = 0.25
     """Factor on the generator's channels; 1 is the paper's."""
-    discriminator_width: float = 1.0
+    discriminator_width: float = 0.25
     """Factor on the discriminator's channels."""
     norm: str = "instance"
     """instance, batch, masked or none."""
@@ -49,13 +49,14 @@ class Options:
     """Convolutions in bfloat16."""
     l1: float = 10.0
     """Weight of the L1 loss."""
-    gan: float = 1.0
-    """Weight of the cGAN loss; 0 leaves the discriminator out."""
-    rate: float = 2e-4
+    gan: float = 0.1
+    """Weight of the cGAN loss; 0 leaves the discriminator out. At the paper's 1 the discriminator
+    wins within 2,000 steps of 1e-3, and its slope outweighs that of L1 by 15."""
+    rate: float = 1e-3
     """Adam's learning rate of the generator."""
-    discriminator_rate: float = 2e-4
+    discriminator_rate: float = 1e-4
     """Adam's learning rate of the discriminator."""
-    fall: float = 0.5
+    fall: float = 0.6
     """Share of the run, of its steps or minutes, in which both rates fall to 0 at its end."""
     average: bool = False
     """Evaluates and exports a running average of the parameters."""

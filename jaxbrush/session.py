@@ -1,0 +1,430 @@
+"""A painting in progress: pen samples in, a preview at once, the networks' paint when it is done.
+
+The only object with a life of its own in this package: it holds a canvas, a thread that runs the
+networks stroke by stroke, and what undo needs. All that computes is in `painter`.
+"""
+
+import collections
+import dataclasses
+import queue
+import threading
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbrush import painter
+from jaxbrush.brush import BrushParams, advance, begin
+from jaxbrush.canvas import Canvas
+from jaxbrush.data import PREVIEW_FILM
+from jaxbrush.painter import Nets, PainterConfig
+from jaxbrush.pairs import coated
+from jaxbrush.recordings import BrushEvent, ColorEvent, StrokeEvent
+from jaxbrush.recordings import Session as Recording
+from jaxbrush.stages import touches
+from jaxbrush.stylus import Stroke, make_stroke
+
+PIECE = 32
+"""Stamps that the preview moves the brush at once; a multiple of every stride in use."""
+FIELDS = ("time", "x", "y", "pressure", "altitude", "azimuth", "twist")
+_UPRIGHT = {"altitude": 0.5 * np.pi, "azimuth": 0.0, "twist": 0.0}
+
+
+@dataclasses.dataclass(frozen=True)
+class Patch:
+    """A part of the picture that is new. stroke: number of the stroke, from 1. corner: first pixel
+    (y, x). canvas: of numpy arrays. final: False for a preview. error: what stopped the networks;
+    the preview then stays."""
+
+    stroke: int
+    corner: tuple[int, int]
+    canvas: Canvas
+    final: bool
+    error: Exception | None = None
+
+
+@dataclasses.dataclass(eq=False)
+class _Job:
+    """A stroke on its way. box: (y, x) slices that it may change, once known."""
+
+    number: int
+    brush: BrushParams
+    color: tuple[float, float, float]
+    event: dict
+    stroke: Stroke | None = None
+    samples: dict | None = None
+    cancelled: bool = False
+    box: tuple[slice, slice] | None = None
+    before: Canvas | None = None
+    error: Exception | None = None
+
+
+def _piece(options: PainterConfig, brush, motion, stroke):
+    track, motion = advance(options.brush, brush, motion, stroke)
+    track = coated(track)
+    return track, touches(options, track), motion
+
+
+_advance = jax.jit(_piece)
+_begin = jax.jit(begin, static_argnums=0)
+
+
+class _Pen:
+    """The stroke under the pen: its samples, and how far the preview has moved the brush."""
+
+    def __init__(self, options: PainterConfig, brush: BrushParams):
+        self.options, self.brush = options, brush
+        self.depth = float(brush.press_depth)
+        self.samples = {name: np.zeros(0) for name in FIELDS}
+        self.way = np.zeros(0)
+        self.motion, self.done = None, 0
+
+    def add(self, new: dict):
+        """Takes samples, and measures the way to each in stamps, as `stylus.resample` does."""
+        joined = {n: np.concatenate([self.samples[n], new[n]]) for n in FIELDS}
+        for name in ("azimuth", "twist"):
+            joined[name] = np.unwrap(joined[name])
+        d = [np.diff(joined[n]) for n in ("x", "y", "pressure")]
+        steps = np.sqrt(d[0] ** 2 + d[1] ** 2 + (self.depth * d[2]) ** 2) / self.options.pixel
+        self.samples, self.way = joined, np.concatenate([[0.0], np.cumsum(steps)])
+
+    def _stamps(self, first: int) -> Stroke:
+        """PIECE + 1 stamps from number `first` on; those past the pen repeat its place."""
+        number = first + np.arange(PIECE + 1)
+        at = np.minimum(number, self.way[-1])
+        now = {n: np.interp(at, self.way, self.samples[n]).astype(np.float32) for n in FIELDS}
+        return Stroke(
+            time=now["time"] - np.float32(self.samples["time"][0]),
+            position=np.stack([now["x"], now["y"]], 1),
+            pressure=now["pressure"],
+            altitude=now["altitude"],
+            azimuth=now["azimuth"],
+            twist=now["twist"],
+            valid=number < np.ceil(self.way[-1]) + 1,
+        )
+
+    def advance(self):
+        """(track, touches) of each piece that is new or has grown."""
+        config = self.options.brush
+        if self.motion is None:
+            self.motion = _begin(config, self.brush, self._stamps(0))
+        while True:
+            piece = self._stamps(self.done)
+            track, bounds, motion = _advance(self.options, self.brush, self.motion, piece)
+            yield track, bounds
+            # Only once the pen is past it, a piece is what it will stay.
+            if self.way[-1] < self.done + PIECE:
+                return
+            self.motion, self.done = motion, self.done + PIECE
+
+    def stroke(self) -> Stroke:
+        s = self.samples
+        return make_stroke(
+            np.stack([s["x"], s["y"]], 1).astype(np.float32),
+            (s["time"] - s["time"][0]).astype(np.float32),
+            *(s[n].astype(np.float32) for n in FIELDS[3:]),
+        )
+
+
+def _checked(pen: _Pen, given: dict) -> dict:
+    count = np.size(given["x"])
+    out = {}
+    for name in FIELDS:
+        value = _UPRIGHT[name] if given[name] is None else given[name]
+        value = np.asarray(value, float)
+        if value.size not in (1, count) or value.ndim > 1 or not np.all(np.isfinite(value)):
+            raise ValueError(f"{name} = {given[name]!r}: expected {count} finite numbers")
+        out[name] = np.broadcast_to(value, (count,))
+    if count and not (0.0 <= out["pressure"].min() and out["pressure"].max() <= 1.0):
+        raise ValueError(f"pressure = {given['pressure']!r}: expected numbers within [0, 1]")
+    times = np.concatenate([pen.samples["time"][-1:], out["time"]])
+    if np.any(np.diff(times) < 0.0):
+        raise ValueError(f"time = {given['time']!r}: expected no step back")
+    return out
+
+
+class Session:
+    """Paints while the pen moves.
+
+    Call from one thread. `begin`, `add`, `end` draw a stroke; each returns in a frame. `poll` gives
+    what the networks have finished since. `with Session(...) as session` closes it at the end.
+
+    Args:
+      options, nets: of the painter. canvas: what is painted on. undo: strokes that can be taken
+        back.
+      paint: what paints a stroke, for tests: `painter.paint_stroke`.
+    """
+
+    def __init__(
+        self, options: PainterConfig, nets: Nets, canvas: Canvas, undo: int = 32,
+        paint=painter.paint_stroke,
+    ):  # fmt: skip
+        self.options, self._nets, self._paint = options, nets, paint
+        self._canvas = canvas
+        self._shown = Canvas(np.array(canvas.height), np.array(canvas.color))
+        # Number of the latest stroke whose preview is over a pixel.
+        self._owner = np.zeros(canvas.height.shape, np.int32)
+        self._lock = threading.Lock()
+        self._idle = threading.Condition(self._lock)
+        self._queue = queue.SimpleQueue()
+        self._waiting: list[_Job] = []
+        self._history = collections.deque(maxlen=undo)
+        self._news: list[Patch] = []
+        self._strokes: list[_Job] = []
+        self._count, self._open, self._pen, self._closed = 0, None, None, False
+        self._worker = threading.Thread(target=self._work, name="painter", daemon=True)
+        self._worker.start()
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *error):
+        self.close()
+
+    @property
+    def canvas(self) -> Canvas:
+        """The finished picture: strokes that the networks are done with."""
+        return self._canvas
+
+    @property
+    def shown(self) -> Canvas:
+        """The picture with previews of what is not finished; a copy, as numpy arrays."""
+        return jax.tree.map(np.copy, self._shown)
+
+    def begin(self, brush: BrushParams, color, event: dict | None = None) -> int:
+        """Sets the brush down for a stroke.
+
+        Args:
+          brush: of `options.brush`. color: (3,) linear RGB. event: the brush in the recording.
+
+        Returns:
+          Number of the stroke.
+
+        Raises:
+          RuntimeError: a stroke is open, or the session is closed.
+        """
+        if self._closed or self._open:
+            raise RuntimeError("the session is closed" if self._closed else "a stroke is open")
+        self._count += 1
+        color = tuple(float(c) for c in color)
+        self._open = _Job(self._count, brush, color, event or {})
+        self._pen = _Pen(self.options, brush)
+        return self._count
+
+    def add(self, time, x, y, pressure, altitude=None, azimuth=None, twist=None) -> list[Patch]:
+        """Moves the pen along new samples: numbers, or arrays of equal length.
+
+        Args:
+          time: [s], not decreasing. x, y: on the canvas [mm]. pressure: [0, 1]. altitude, azimuth,
+            twist: [rad]; upright where they are not given.
+
+        Returns:
+          The parts of the preview that changed.
+
+        Raises:
+          ValueError: bad samples, of which none is taken. RuntimeError: no stroke is open.
+        """
+        if not self._open:
+            raise RuntimeError("no stroke is open: call begin")
+        new = _checked(self._pen, dict(zip(
+            FIELDS, (time, x, y, pressure, altitude, azimuth, twist), strict=True
+        )))  # fmt: skip
+        if not new["x"].size:
+            return []
+        self._pen.add(new)
+        found = [self._preview(*piece) for piece in self._pen.advance()]
+        return [patch for patch in found if patch]
+
+    def end(self) -> int:
+        """Lifts the brush; the networks take over. Returns the number of the stroke.
+
+        Raises:
+          RuntimeError: no stroke is open.
+        """
+        if not self._open:
+            raise RuntimeError("no stroke is open: call begin")
+        job, pen, self._open, self._pen = self._open, self._pen, None, None
+        if pen.samples["x"].size:
+            job.stroke, job.samples = pen.stroke(), pen.samples
+            with self._lock:
+                self._strokes.append(job)
+                self._waiting.append(job)
+            self._queue.put(job)
+        return job.number
+
+    def poll(self) -> list[Patch]:
+        """Parts of the picture that the networks have finished since the last call."""
+        with self._lock:
+            news, self._news = self._news, []
+        for patch in news:
+            self._show(patch.corner, patch.canvas, patch.stroke)
+        return news
+
+    def wait(self, timeout: float | None = None) -> bool:
+        """Waits until every stroke is finished; False after `timeout` seconds."""
+        with self._idle:
+            return self._idle.wait_for(lambda: not self._waiting, timeout)
+
+    def undo(self) -> Patch | None:
+        """Takes back the last stroke: the open one, one on its way, or a finished one.
+
+        Returns:
+          The picture as it was there, None where there is nothing to take back or to show.
+        """
+        if self._open:
+            job, self._open, self._pen = self._open, None, None
+            return self._uncover(job.number)
+        with self._lock:
+            job = self._strokes[-1] if self._strokes else None
+            if job is None or (job not in self._waiting and job not in self._history):
+                return None
+            self._strokes.pop()
+            self._news = [p for p in self._news if p.stroke != job.number]
+            finished = job not in self._waiting
+            if finished:
+                self._history.pop()
+                if job.box is not None:
+                    self._canvas = _with(self._canvas, job.box, job.before)
+            else:
+                job.cancelled = True
+                self._waiting.remove(job)
+                self._idle.notify_all()
+        if finished and job.box is not None:
+            corner = tuple(s.start for s in job.box)
+            self._show(corner, job.before, job.number)
+            return Patch(job.number, corner, job.before, True)
+        return self._uncover(job.number)
+
+    def record(self) -> Recording:
+        """The strokes so far, those taken back left out."""
+        events, brush, color = [], None, None
+        for job in self._strokes:
+            if job.event != brush:
+                events.append(BrushEvent(job.event))
+            if job.color != color:
+                events.append(ColorEvent(job.color))
+            brush, color = job.event, job.color
+            s = {n: tuple(float(v) for v in job.samples[n]) for n in FIELDS}
+            events.append(StrokeEvent(s["time"], *(s[n] for n in FIELDS[1:])))
+        h, w = self._canvas.height.shape
+        side = self.options.pixel
+        return Recording((w * side, h * side), 1.0, tuple(events))
+
+    def close(self):
+        """Ends the open stroke, waits for the networks, and stops the thread."""
+        if self._closed:
+            return
+        if self._open:
+            self.end()
+        self._closed = True
+        self._queue.put(None)
+        self._worker.join()
+
+    def _preview(self, track, bounds) -> Patch | None:
+        job = self._open
+        shape = self._owner.shape
+        box = painter.place(self.options, shape, bounds)
+        if box is None:
+            return None
+        cover, corner = painter.covered(self.options, box, track)
+        cover = np.asarray(cover)
+        low = np.maximum(corner, 0)
+        high = np.minimum(np.asarray(corner) + cover.shape, shape)
+        cover = cover[
+            tuple(slice(*x) for x in np.stack([low, high], 1) - np.asarray(corner)[:, None])
+        ]
+        if not cover.any():
+            return None
+        at = tuple(slice(*x) for x in np.stack([low, high], 1))
+        height, color = self._shown.height[at], self._shown.color[at]
+        height[cover] = np.maximum(height[cover], PREVIEW_FILM)
+        color[cover] = job.color
+        self._owner[at][cover] = job.number
+        part = Canvas(height.copy(), color.copy())
+        return Patch(job.number, tuple(int(x) for x in low), part, False)
+
+    def _show(self, corner, part: Canvas, number: int):
+        """Puts a finished part where no later preview is."""
+        h, w = part.height.shape
+        at = (slice(corner[0], corner[0] + h), slice(corner[1], corner[1] + w))
+        take = self._owner[at] <= number
+        self._shown.height[at][take] = part.height[take]
+        self._shown.color[at][take] = part.color[take]
+        self._owner[at][take] = 0
+
+    def _uncover(self, number: int) -> Patch | None:
+        """Takes the preview of a stroke away."""
+        rows, columns = np.nonzero(self._owner == number)
+        if not rows.size:
+            return None
+        at = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
+        part = _part(self._canvas, at)
+        take = self._owner[at] == number
+        self._shown.height[at][take] = part.height[take]
+        self._shown.color[at][take] = part.color[take]
+        self._owner[at][take] = 0
+        corner = (int(at[0].start), int(at[1].start))
+        return Patch(number, corner, jax.tree.map(lambda x: x[at].copy(), self._shown), False)
+
+    def _work(self):
+        while (job := self._queue.get()) is not None:
+            with self._lock:
+                if job.cancelled:
+                    continue
+                canvas = self._canvas
+            box = []
+
+            def watch(stage, value, box=box, shape=canvas.height.shape):
+                if stage == "brush":
+                    box.append(painter.reached(shape, value[1]))
+
+            try:
+                color = np.asarray(job.color, np.float32)
+                new = self._paint(
+                    self.options, self._nets, canvas, job.brush, color, job.stroke, watch=watch
+                )
+                new = jax.block_until_ready(new)
+            except Exception as error:  # whatever it is, the painter must be told and go on
+                new, job.error = None, error
+            with self._lock:
+                if not job.cancelled:
+                    self._finish(job, canvas, new, box[0] if box else None)
+                    self._waiting.remove(job)
+                    self._idle.notify_all()
+
+    def _finish(self, job: _Job, before: Canvas, after: Canvas | None, box):
+        at = np.nonzero(self._owner == job.number)
+        if at[0].size:
+            # All of its preview goes, wherever that was.
+            shown = [(int(x.min()), int(x.max()) + 1) for x in at]
+            if box is not None:
+                ends = zip(shown, ((s.start, s.stop) for s in box), strict=True)
+                shown = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in ends]
+            box = tuple(slice(*x) for x in shown)
+            if after is None:
+                # What was shown stays, so that no stroke is lost.
+                part, mine = _part(before, box), self._owner[box] == job.number
+                part.height[mine] = self._shown.height[box][mine]
+                part.color[mine] = self._shown.color[box][mine]
+                after = _with(before, box, part)
+        self._history.append(job)
+        if after is None or box is None:
+            return
+        job.box, job.before = box, _part(before, box)
+        self._canvas = after
+        corner = tuple(s.start for s in box)
+        self._news.append(Patch(job.number, corner, _part(after, box), True, job.error))
+
+
+def _part(canvas: Canvas, at) -> Canvas:
+    # Cut on the host: a slice on the device would compile for every new size.
+    return jax.tree.map(lambda x: np.asarray(x)[at].copy(), canvas)
+
+
+def _with(canvas: Canvas, at, part: Canvas) -> Canvas:
+    def put(x, new):
+        x = np.array(x)
+        x[at] = new
+        return jnp.asarray(x)
+
+    return jax.tree.map(put, canvas, part)

@@ -1,0 +1,346 @@
+"""Stages of the neural painting system (paper section 4.4), each a pure function, and `paint_on`,
+which joins them in one function of fixed sizes, to jit and differentiate:
+
+  place_stamps, trace   stylus -> track of the bristles with their coat of paint
+  draw                  track -> trajectory maps and mask on the box of the stroke
+  cut                   maps and canvas -> patches where the mask is
+  evaluate              patches -> painted: the height network, the color network on its output
+  blend, lay            painted patches -> tiles -> canvas, where the mask is
+  preview               maps -> canvas, without networks
+
+`painter` picks the sizes and runs them.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbrush import data, patches, poisson
+from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, rollout
+from jaxbrush.canvas import Canvas, from_srgb, to_srgb
+from jaxbrush.metrics import image_scale
+from jaxbrush.models import Generator, GeneratorConfig
+from jaxbrush.pairs import REACH, coated
+from jaxbrush.patches import Box, Layout, PatchConfig
+from jaxbrush.raster import WIDTH, dilate, trajectory_maps
+from jaxbrush.structs import config, state
+from jaxbrush.stylus import Stroke, resample
+
+BLENDS = ("cut", "feather", "poisson")
+MOMENTS = ("patch", "stroke")
+NOWHERE = 1e9
+"""Bounds [pixels] of what touches nothing: they begin there and end at minus that."""
+
+
+@config
+class PainterConfig:
+    """Static choices.
+
+    pixel: side of a pixel of the canvas [mm], that of the training pairs. brush: how bristles are
+    simulated. patches: how a stroke is cut. blend: how patches become one picture, one of BLENDS.
+    moments: "patch", each normalised by its own moments; or "stroke", by those of all of its
+    stroke, which are then painted at once. edge: of soft maps [mm], or None for exact ones.
+    stamps: buckets of stamps; a stroke that needs more gets the most, further
+    apart. cells: buckets of the side of a box, in patches. batch: patches that the networks are
+    given at once.
+    """
+
+    pixel: float = 0.125
+    brush: BrushConfig = BrushConfig()  # noqa: RUF009
+    patches: PatchConfig = PatchConfig()  # noqa: RUF009
+    blend: str = "feather"
+    moments: str = "patch"
+    edge: float | None = None
+    stamps: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
+    cells: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
+    batch: int = 1
+
+    def __post_init__(self):
+        for name, known in (("blend", BLENDS), ("moments", MOMENTS)):
+            if getattr(self, name) not in known:
+                raise ValueError(
+                    f"PainterConfig.{name} = {getattr(self, name)!r}: expected one of {known}"
+                )
+        for name, least in (("stamps", 2), ("cells", 1)):
+            value = getattr(self, name)
+            if not value or min(value) < least or list(value) != sorted(set(value)):
+                raise ValueError(
+                    f"PainterConfig.{name} = {value}: expected rising numbers of at least {least}"
+                )
+        if not self.pixel > 0.0 or self.batch < 1:
+            raise ValueError(
+                f"PainterConfig.pixel = {self.pixel}, batch = {self.batch}: expected a positive "
+                "side and at least 1"
+            )
+
+
+@config
+class Sizes:
+    """What fixes the shapes of a stroke. stamps: of the track. cells: rows and columns of patches
+    of its box. count: of patches."""
+
+    stamps: int
+    cells: tuple[int, int]
+    count: int
+
+
+@state
+class Nets:
+    """Variables of the height and the color network; their configs are static."""
+
+    height: dict
+    color: dict
+    height_config: GeneratorConfig = dataclasses.field(metadata={"static": True})
+    color_config: GeneratorConfig = dataclasses.field(metadata={"static": True})
+
+
+@state
+class Drawn:
+    """Maps of a stroke on the grid of its box: pressure, time (h, w, 1), trajectory (h, w, 3) in
+    sRGB, as in a training pair; mask: (h, w, 1) where it may change the canvas, 0 off it. whole: ()
+    as in TrajectoryMaps."""
+
+    pressure: jax.Array
+    time: jax.Array
+    trajectory: jax.Array
+    mask: jax.Array
+    whole: jax.Array
+
+
+def check_canvas(canvas: Canvas):
+    """Raises ValueError unless height and color have one size."""
+    h, w = canvas.height.shape
+    if min(h, w) < 1 or canvas.color.shape != (h, w, 3):
+        raise ValueError(
+            f"canvas of height {canvas.height.shape} and color {canvas.color.shape}: expected "
+            "(h, w) and (h, w, 3)"
+        )
+
+
+def place_stamps(options: PainterConfig, brush: BrushParams, stroke: Stroke, stamps: int):
+    """The stroke as `stamps` (static) stamps at most a pixel apart, as in training pairs."""
+    return resample(stroke, stamps, options.pixel, np.inf, brush.press_depth)
+
+
+def trace(options: PainterConfig, brush: BrushParams, stroke: Stroke) -> BristleTrack:
+    """Moves a loaded brush along the stamps of a stroke."""
+    return coated(rollout(options.brush, brush, stroke))
+
+
+def touches(options: PainterConfig, track: BristleTrack):
+    """Where the bristles draw on their way to each stamp: (t, 4) first y, x and last y, x [pixels]
+    of the canvas that anything of it touches; NaN where the track is not finite."""
+    tip, force = track.position[:, -1, :2], track.force[:, -1]
+    start = jnp.concatenate([tip[:1], tip[:-1]])
+    known = track.valid & jnp.concatenate([track.valid[:1], track.valid[:-1]])
+    soft = 0.0 if options.edge is None else options.edge
+    down = (force > 0.0) | (track.position[:, -1, 2] < 0.5 * soft)
+    down = (down | jnp.concatenate([down[:1], down[:-1]])) & known[:, None]
+    reach = 0.5 * (WIDTH + soft)
+    low = jnp.where(down[:, None], jnp.minimum(tip, start) - reach, NOWHERE)
+    high = jnp.where(down[:, None], jnp.maximum(tip, start) + reach, -NOWHERE)
+    low = jnp.floor(jnp.min(low, axis=-1) / options.pixel)[:, ::-1] - 1.0
+    high = jnp.ceil(jnp.max(high, axis=-1) / options.pixel)[:, ::-1] + 1.0
+    bounds = jnp.concatenate([low, high], axis=1)
+    sound = jnp.all(jnp.isfinite(tip), axis=(1, 2)) | ~track.valid
+    return jnp.where(sound[:, None], bounds, jnp.nan)
+
+
+def last_touch(options: PainterConfig, corner, bounds):
+    """The last stamp at which a stroke changes the maps of patches: after it they are final, but
+    for the times, which are shares of the whole stroke's duration.
+
+    Of the first stamps of a stroke it tells which patches the brush has left so far; a brush that
+    comes back touches a patch again.
+
+    Args:
+      corner: (n, 2) of the patches. bounds: (t, 4) from `touches`.
+
+    Returns:
+      (n,) int, -1 where the stroke does not come.
+    """
+    # The mask reaches beyond what is touched.
+    first = corner[:, None].astype(bounds.dtype) - float(REACH)
+    last = first + float(options.patches.size + 2 * REACH)
+    hit = (bounds[None, :, :2] < last) & (bounds[None, :, 2:] >= first)
+    stamp = jnp.arange(bounds.shape[0], dtype=jnp.int32)[None]
+    return jnp.max(jnp.where(jnp.all(hit, axis=-1), stamp, -1), axis=1)
+
+
+def draw(
+    options: PainterConfig, box: Box, shape, track: BristleTrack, color, duration=None
+) -> Drawn:
+    """Draws the maps of a stroke on its box, scaled as in training pairs.
+
+    Args:
+      shape: (h, w) of the canvas. color: (3,) of the paint, linear RGB.
+      duration: of the whole stroke [s], where the track is only its beginning.
+    """
+    grid = patches.grid_of(options.patches, box, options.pixel)
+    maps = trajectory_maps(grid, track, to_srgb(jnp.asarray(color, float)), edge=options.edge)
+    time = maps.time
+    if duration is not None:
+        end = jnp.max(jnp.where(track.valid, track.time, track.time[0]))
+        time = time * ((end - track.time[0]) / duration)
+    at = patches.corner_of(options.patches, box)
+    row, column = (at[k] + jnp.arange(grid.shape[k], dtype=jnp.int32) for k in (0, 1))
+    inside = ((row >= 0) & (row < shape[0]))[:, None] & ((column >= 0) & (column < shape[1]))[None]
+    # Kept as an array: worked out again at every shift of the dilation it is slow.
+    cover = jax.lax.optimization_barrier(maps.coverage)
+    return Drawn(
+        pressure=maps.pressure[..., None],
+        time=time[..., None],
+        trajectory=maps.color,
+        mask=jnp.where(inside, dilate(cover, REACH), 0.0)[..., None],
+        whole=maps.whole,
+    )
+
+
+def cut(options: PainterConfig, box: Box, drawn: Drawn, canvas: Canvas, layout: Layout) -> dict:
+    """Patches of the maps and of the canvas under them, in the form of training pairs.
+
+    Returns:
+      dict of height [mm], pressure, time, mask (n, size, size, 1), color and trajectory (n, size,
+      size, 3) in sRGB.
+    """
+    size = options.patches.size
+    names = ("pressure", "time", "mask", "trajectory")
+    field = jnp.concatenate([getattr(drawn, name) for name in names], axis=-1)
+    field = patches.cut(options.patches, box, field, layout.corner)
+    return {
+        "height": patches.cut_canvas(canvas.height, layout.corner, size)[..., None],
+        "color": to_srgb(patches.cut_canvas(canvas.color, layout.corner, size)),
+        **dict(zip(names, jnp.split(field, (1, 2, 3), axis=-1), strict=True)),
+    }
+
+
+def evaluate(options: PainterConfig, nets: Nets, pairs: dict, present=None):
+    """Paints patches: the height network, then the color network on its output.
+
+    Args:
+      pairs: n patches from `cut`. present: (n,) bool, which count in moments of the whole stroke.
+
+    Returns:
+      (n, size, size, 4) in image scale: height as a share of the largest, sRGB.
+    """
+    pooled = options.moments == "stroke"
+    core = None
+    if pooled:
+        core = jnp.asarray(patches.core(options.patches))[None]
+        core = core * jnp.ones((pairs["mask"].shape[0], 1, 1, 1))
+        if present is not None:
+            core = core * present[:, None, None, None].astype(core.dtype)
+
+    def run(generator, variables, inputs):
+        weights = core
+        if generator.norm == "masked":
+            weights = pairs["mask"] if core is None else pairs["mask"] * core
+        found = Generator(generator).apply(variables, inputs, weights, pooled=pooled)
+        return image_scale(found)
+
+    level = data.LEVELS["height"]
+    before = jnp.clip(pairs["height"], 0.0, level)
+    # Chosen where there is none: a root has no slope at 0.
+    press = jnp.where(pairs["pressure"] > 0.0, pairs["pressure"], 0.0)
+    given = pairs | {
+        "height": before, "pressure": press, "sweeps": jnp.zeros_like(press),
+        "new_height": before, "new_color": pairs["color"],
+    }  # fmt: skip
+    height = run(nets.height_config, nets.height, data.height_batch(given).inputs)
+    # The canvas as it will be: beyond the mask nothing changes.
+    given["new_height"] = before + pairs["mask"] * (level * height - before)
+    color = run(nets.color_config, nets.color, data.color_batch(given).inputs)
+    return jnp.concatenate([height, color], axis=-1)
+
+
+def blend(options: PainterConfig, painted, layout: Layout):
+    """Tiles (m, step, step, c) of painted patches (n, size, size, c)."""
+    if options.blend == "poisson":
+        return poisson.merge(options.patches, painted, layout)
+    return patches.merge(options.patches, painted, layout, sharp=options.blend == "cut")
+
+
+def lay(
+    options: PainterConfig, box: Box, drawn: Drawn, canvas: Canvas, layout: Layout, painted
+) -> Canvas:
+    """Blends painted patches and lays them over the canvas where the mask is."""
+    tiles = blend(options, painted, layout)
+    mask = patches.cut_tiles(options.patches, box, drawn.mask[..., 0], layout)
+    changed = mask > 0.0
+
+    def over(field, new):
+        old = patches.cut_canvas(field, layout.tile, options.patches.step)
+        share = mask.reshape(mask.shape + (1,) * (new.ndim - 3))
+        there = changed.reshape(share.shape)
+        return patches.place(
+            old + jnp.where(there, share * (new - old), 0.0), layout, field, changed
+        )
+
+    return Canvas(
+        height=over(canvas.height, data.LEVELS["height"] * tiles[..., 0]),
+        color=over(canvas.color, from_srgb(tiles[..., 1:])),
+    )
+
+
+def paint_on(
+    options: PainterConfig, sizes: Sizes, nets: Nets, canvas: Canvas, brush: BrushParams, color,
+    stroke: Stroke, first,
+):  # fmt: skip
+    """Paints one stroke in given sizes; pure: jit it, and differentiate it in all but `first`. For
+    slopes of positions `options.edge` makes the maps soft.
+
+    Args:
+      sizes, first: from `plan`; first (2,) int is the number of the box's first patch along y, x.
+      canvas: (h, w). color: (3,) of the paint, linear RGB. stroke: samples of the stylus [mm].
+
+    Returns:
+      (Canvas, ok): ok () bool is False if the count is too small, or soft maps have gaps.
+    """
+    check_canvas(canvas)
+    box = Box(first=jnp.asarray(first, jnp.int32), cells=sizes.cells)
+    track = trace(options, brush, place_stamps(options, brush, stroke, sizes.stamps))
+    drawn = draw(options, box, canvas.height.shape, track, color)
+    layout = patches.layout(options.patches, box, drawn.mask[..., 0], sizes.count)
+    pairs = cut(options, box, drawn, canvas, layout)
+    if options.moments == "stroke" or sizes.count <= options.batch:
+        painted = evaluate(options, nets, pairs, layout.present)
+    else:
+        one = lambda pair: evaluate(  # noqa: E731
+            options, nets, jax.tree.map(lambda x: x[None], pair)
+        )[0]
+        painted = jax.lax.map(one, pairs, batch_size=options.batch)
+    return lay(options, box, drawn, canvas, layout, painted), layout.enough & drawn.whole
+
+
+def preview(options: PainterConfig, box: Box, drawn: Drawn, canvas: Canvas, color) -> Canvas:
+    """Lays a stroke over the canvas as `data.preview` shows it, from its maps alone."""
+    shape = canvas.height.shape
+    corner = patches.corner_of(options.patches, box)
+    touch = jnp.concatenate([drawn.pressure, drawn.time], axis=-1)
+    sides = [min(a, b) for a, b in zip(shape, touch.shape, strict=False)]
+    # Clipped here: XLA's own clamping is wrong in some releases.
+    at = [jnp.clip(corner[k], 0, shape[k] - sides[k]) for k in (0, 1)]
+    for k in (0, 1):
+        # What is rolled in from the other end lies off the box.
+        index = at[k] - corner[k] + jnp.arange(sides[k], dtype=jnp.int32)
+        held = (index >= 0) & (index < touch.shape[k])
+        touch = jax.lax.slice_in_dim(jnp.roll(touch, corner[k] - at[k], k), 0, sides[k], axis=k)
+        touch = jnp.where(jnp.expand_dims(held, (1 - k, 2)), touch, 0.0)
+    under = jax.lax.dynamic_slice(canvas.color, (*at, 0), (*sides, 3))
+    shown = data.preview(
+        {
+            "height": jax.lax.dynamic_slice(canvas.height, at, sides)[..., None],
+            "pressure": touch[..., :1],
+            "time": touch[..., 1:],
+            # A choice between two colors, so it may as well be made in linear RGB.
+            "color": under,
+            "trajectory": jnp.broadcast_to(jnp.asarray(color, under.dtype), under.shape),
+        }
+    )
+    height, color = shown["new_height"][..., 0], shown["new_color"]
+    return Canvas(
+        height=jax.lax.dynamic_update_slice(canvas.height, height, at),
+        color=jax.lax.dynamic_update_slice(canvas.color, color, (*at, 0)),
+    )

@@ -1,0 +1,292 @@
+"""The painting system end to end: where it paints, in which sizes, early or late, and its slope."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbrush import checkpoint, data, painter, patches, stages
+from jaxbrush.brush import BrushConfig, make_brush
+from jaxbrush.canvas import Canvas, to_srgb
+from jaxbrush.metrics import image_scale
+from jaxbrush.models import Generator, GeneratorConfig
+from jaxbrush.stylus import make_stroke
+
+OPTIONS = painter.PainterConfig(
+    brush=BrushConfig(nodes=4, track_nodes=1, approach=2),
+    patches=patches.PatchConfig(size=28, overlap=8), stamps=(32,), cells=(5,), batch=16,
+)  # fmt: skip
+BRUSH = make_brush(
+    jax.random.key(0), OPTIONS.brush, "round", 16, width=1.0, length=5.0, press_depth=1.5
+)
+PAINT = (0.02, 0.1, 0.5)
+
+
+def network(inputs, outputs, norm="instance", width=0.05):
+    config = GeneratorConfig(outputs=outputs, width=width, norm=norm)
+    shape = jax.eval_shape(
+        Generator(config).init,
+        jax.random.key(0),
+        jnp.zeros((1, 4, 4, inputs)),
+        jnp.ones((1, 4, 4, 1)),
+    )
+    rng = np.random.default_rng(inputs)
+    # Larger than what training starts from: what is painted has contrast.
+    draw = lambda x: jnp.asarray(rng.normal(0.0, 0.2, x.shape), jnp.float32)  # noqa: E731
+    return checkpoint.Exported(jax.tree.map(draw, shape), config, {"made by": "a test"})
+
+
+NETS = painter.make_nets(network(2, 1), network(8, 3))
+
+
+LONG = jax.tree.map(np.asarray, make_stroke(np.zeros((80, 2)), pressure=0.6))
+
+
+def canvas(h=64, w=64, seed=0):
+    rng = np.random.default_rng(seed)
+    draw = lambda *shape: jnp.asarray(rng.uniform(0.1, 0.9, shape), jnp.float32)  # noqa: E731
+    return Canvas(height=draw(h, w), color=draw(h, w, 3))
+
+
+def line(start, end, count=9):
+    share = np.linspace(0.0, 1.0, max(count, 2))[:count, None]
+    position = (1.0 - share) * np.asarray(start) + share * np.asarray(end)
+    # By numpy: every length would compile anew.
+    given = jax.tree.map(lambda x: x[:count], LONG)
+    return dataclasses.replace(given, position=position.astype(np.float32))
+
+
+def maps_of(stroke, shape=(64, 64), options=OPTIONS):
+    track, bounds = painter._begin(options, BRUSH, stroke)
+    box = painter.place(options, shape, bounds)
+    drawn, _ = painter._draw(options, box, shape, track, jnp.asarray(PAINT))
+    return box, drawn, track, bounds
+
+
+def mask_of(stroke, shape=(64, 64)):
+    """The mask on the canvas."""
+    box, drawn, *_ = maps_of(stroke, shape)
+    y, x = np.asarray(patches.corner_of(OPTIONS.patches, box))
+    full, mask = np.zeros(shape), np.asarray(drawn.mask[..., 0])
+    rows = slice(max(y, 0), min(y + mask.shape[0], shape[0]))
+    columns = slice(max(x, 0), min(x + mask.shape[1], shape[1]))
+    full[rows, columns] = mask[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
+    return full
+
+
+def check_painted(found, before, stroke):
+    mask = mask_of(stroke, before.height.shape) > 0.0
+    for new, old in ((found.height, before.height), (found.color, before.color)):
+        new, old = np.asarray(new), np.asarray(old)
+        assert np.all(np.isfinite(new))
+        np.testing.assert_array_equal(new[~mask], old[~mask])
+        assert np.mean(new[mask] != old[mask]) > 0.99
+    assert found.height.max() <= data.LEVELS["height"] and found.color.max() <= 1.0
+    return mask
+
+
+PATHS = {
+    "inside": ((3.0, 3.0), (5.0, 4.5)), "off the edge": ((3.0, 4.0), (3.2, -2.0)),
+    "in the corner": ((8.1, 8.1), (7.5, 8.2)), "larger than the canvas": ((-1.0, 3.0), (9.0, 5.0)),
+    "one sample": ((4.0, 4.0), (4.0, 4.0)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_only_the_mask_is_painted(name):
+    before = canvas()
+    stroke = line(*PATHS[name], 1 if name == "one sample" else 9)
+    found = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
+    assert check_painted(found, before, stroke).any()
+
+
+def test_strokes_that_touch_nothing_change_nothing():
+    before = canvas()
+    for stroke in (line((-30.0, -30.0), (-29.0, -29.0)), line((3.0, 3.0), (4.0, 4.0))):
+        if stroke.position[0, 0] > 0.0:
+            stroke = dataclasses.replace(stroke, valid=np.zeros_like(stroke.valid))
+        found = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
+        np.testing.assert_array_equal(found.color, before.color)
+        np.testing.assert_array_equal(found.height, before.height)
+    assert painter.plan(OPTIONS, before, BRUSH, stroke) is None
+
+
+def test_canvases_of_any_size():
+    """The lattice is the canvas's: where the canvas ends moves no patch."""
+    large, stroke = canvas(90, 75), line((1.0, 1.0), (1.7, 1.5))
+    found = painter.paint_stroke(OPTIONS, NETS, large, BRUSH, PAINT, stroke)
+    check_painted(found, large, stroke)
+    small = Canvas(height=large.height[:64, :64], color=large.color[:64, :64])
+    again = painter.paint_stroke(OPTIONS, NETS, small, BRUSH, PAINT, stroke)
+    np.testing.assert_allclose(again.color, found.color[:64, :64], atol=1e-5)
+    np.testing.assert_allclose(again.height, found.height[:64, :64], atol=1e-5)
+    tiny = canvas(16, 16)
+    found = painter.paint_stroke(OPTIONS, NETS, tiny, BRUSH, PAINT, stroke)
+    check_painted(found, tiny, stroke)
+
+
+def test_networks_see_what_they_were_trained_on():
+    """One patch by hand, from the dictionary that a data set gives."""
+    box, drawn, *_ = maps_of(line(*PATHS["inside"]))
+    before = canvas()
+    layout, pair = painter._cut(OPTIONS, box, drawn, before, count=16)
+    found = painter._evaluate(OPTIONS, NETS, pair)[:1]
+    pair = {name: np.asarray(x[:1]) for name, x in pair.items()}
+    y, x = np.asarray(layout.corner[0])
+    rows, columns = (np.clip(np.arange(at, at + 28), 0, 63) for at in (y, x))
+    np.testing.assert_allclose(pair["color"][0], to_srgb(before.color)[rows][:, columns], atol=1e-6)
+    assert pair["trajectory"].max(axis=(0, 1, 2)) == pytest.approx(
+        np.asarray(to_srgb(jnp.asarray(PAINT))), abs=1e-6
+    )
+    zero = np.zeros_like(pair["height"])
+    pair |= {"sweeps": zero, "new_height": zero, "new_color": pair["color"]}
+
+    @jax.jit
+    def by_hand(pair):
+        run = lambda net, x: image_scale(  # noqa: E731
+            Generator(net.config).apply(net.variables, x)
+        )
+        height = run(network(2, 1), data.height_batch(pair).inputs)
+        new = jnp.where(pair["mask"] > 0.0, data.LEVELS["height"] * height, pair["height"])
+        color = run(network(8, 3), data.color_batch(pair | {"new_height": new}).inputs)
+        return jnp.concatenate([height, color], axis=-1)
+
+    np.testing.assert_allclose(found, by_hand(pair), atol=1e-5)
+
+
+SOFT = dataclasses.replace(OPTIONS, edge=0.25, stamps=(16,), cells=(2,))
+
+
+def check_slope(error, step):
+    """Of error(shift), which is (value, more), at 0 by finite differences; returns more."""
+    error = jax.jit(jax.value_and_grad(error, has_aux=True))
+    (_, more), slope = error(jnp.zeros(()))
+    (ahead, _), _ = error(jnp.asarray(step))
+    (behind, _), _ = error(jnp.asarray(-step))
+    assert np.isfinite(slope) and abs(slope) > 0.1
+    np.testing.assert_allclose((ahead - behind) / (2.0 * step), slope, rtol=0.05)
+    return more
+
+
+def weighted_sum(after):
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=(64, 64)), jnp.float32)
+    return jnp.sum(weight * (after.height + after.color[..., 0]))
+
+
+def test_the_pure_function_is_the_driver():
+    """And has a slope, here by the color of the paint."""
+    before, stroke = canvas(), jax.tree.map(jnp.asarray, line(*PATHS["inside"]))
+    sizes, first = painter.plan(OPTIONS, before, BRUSH, stroke)
+    way = jnp.asarray([0.5, -1.0, 0.7])
+
+    def error(shift):
+        after, ok = painter.paint_on(
+            OPTIONS, sizes, NETS, before, BRUSH, jnp.asarray(PAINT) + shift * way, stroke, first
+        )
+        return jnp.where(ok, weighted_sum(after), jnp.nan), after
+
+    found = check_slope(error, 2e-3)
+    want = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
+    np.testing.assert_allclose(found.color, want.color, atol=2e-5)
+    np.testing.assert_allclose(found.height, want.height, atol=2e-5)
+
+
+@pytest.mark.slow
+def test_slope_from_canvas_to_stylus():
+    """All the way, by the place of the samples."""
+    before, stroke = canvas(), jax.tree.map(jnp.asarray, line((3.0, 3.0), (4.0, 3.5)))
+    sizes = stages.Sizes(stamps=16, cells=(2, 2), count=4)
+    way = jnp.asarray(np.random.default_rng(0).normal(size=stroke.position.shape), jnp.float32)
+
+    def error(shift):
+        moved = dataclasses.replace(stroke, position=stroke.position + shift * way)
+        after, ok = painter.paint_on(SOFT, sizes, NETS, before, BRUSH, jnp.asarray(PAINT), moved,
+                                     jnp.asarray([0, 0], jnp.int32))  # fmt: skip
+        return jnp.where(ok, weighted_sum(after), jnp.nan), None
+
+    check_slope(error, 2e-3)
+
+
+def test_a_patch_may_be_painted_when_the_brush_has_left_it():
+    """Maps are final there, but for times, which are shares of a duration not known before."""
+    stroke = line((0.5, 0.5), (7.5, 7.0), 65)
+    before, cut = canvas(), jax.jit(stages.cut)
+    box, drawn, track, bounds = maps_of(stroke)
+    count, now = 16, 27
+    layout, pair = painter._cut(OPTIONS, box, drawn, before, count=count)
+    early = dataclasses.replace(track, valid=track.valid & (jnp.arange(32) < now))
+    last = jax.jit(stages.last_touch)(OPTIONS, layout.corner, bounds)
+    seen = jax.jit(stages.touches)(OPTIONS, early)
+    assert np.all(np.asarray(seen[:now]) == np.asarray(bounds[:now]))
+    left = np.asarray(layout.present & (last < now) & (last >= 0))
+    assert 0 < left.sum() < int(layout.present.sum())
+    duration = float(jnp.max(jnp.where(track.valid, track.time, 0.0)) - track.time[0])
+    begun, _ = painter._draw(OPTIONS, box, (64, 64), early, jnp.asarray(PAINT))
+    known = jax.jit(stages.draw)(OPTIONS, box, (64, 64), early, jnp.asarray(PAINT), duration)
+    part = cut(OPTIONS, box, known, before, layout)
+    for name in pair:
+        atol = 1e-5 if name == "time" else 0.0
+        np.testing.assert_allclose(part[name][left], pair[name][left], atol=atol, err_msg=name)
+    late = painter.paint_patches(OPTIONS, NETS, pair, layout)
+    soon = painter.paint_patches(OPTIONS, NETS, part, layout)
+    np.testing.assert_allclose(soon[left], late[left], atol=0.1 / 255.0)
+    # Without the duration, times are too long, and heights alone are final.
+    hasty = painter.paint_patches(OPTIONS, NETS, cut(OPTIONS, box, begun, before, layout), layout)
+    np.testing.assert_allclose(hasty[left][..., 0], late[left][..., 0], atol=0.1 / 255.0)
+    print("color by a wrong duration:", np.abs(hasty[left] - late[left]).max())
+
+
+@pytest.mark.parametrize("strokes", [40, pytest.param(200, marks=pytest.mark.slow)])
+def test_a_session_compiles_a_bounded_number_of_times(strokes):
+    stages_run = (painter._trace, painter._draw, painter._evaluate, painter._cut, painter._lay_over)
+    before = [f._cache_size() for f in stages_run]
+    now, rng = canvas(), np.random.default_rng(0)
+    for k in range(strokes):
+        length = (0.0, 0.5, 1.0, 8.0)[k % 4]
+        start, turn = rng.uniform(0.0, 8.0, 2), rng.uniform(0.0, 6.28)
+        end = start + length * np.array([np.cos(turn), np.sin(turn)])
+        now = painter.paint_stroke(
+            OPTIONS, NETS, now, BRUSH, PAINT, line(start, end, 1 + k % 60), donate=True
+        )
+    compiled = [f._cache_size() - a for f, a in zip(stages_run, before, strict=True)]
+    print("compiled", compiled)
+    # One bucket of stamps, one box; 16 or 32 patches.
+    assert np.all(np.array(compiled) <= [1, 1, 1, 2, 2])
+    assert np.all(np.isfinite(now.color)) and np.all(np.isfinite(now.height))
+
+
+def test_the_preview_is_that_of_the_maps():
+    before, stroke = canvas(), line(*PATHS["off the edge"])
+    found = painter.preview_stroke(OPTIONS, before, BRUSH, PAINT, stroke)
+    changed = np.any(np.asarray(found.color) != np.asarray(before.color), axis=-1)
+    assert 0.0 < changed.sum() < (mask_of(stroke) > 0.0).sum()
+    assert np.all(mask_of(stroke)[changed] > 0.0)
+    np.testing.assert_allclose(np.asarray(found.color)[changed], [PAINT] * changed.sum(), atol=1e-6)
+    assert np.all(np.asarray(found.height)[changed] >= data.PREVIEW_FILM - 1e-6)
+    np.testing.assert_array_equal(
+        np.asarray(found.height)[~changed], np.asarray(before.height)[~changed]
+    )
+
+
+def test_arguments_are_checked(tmp_path):
+    with pytest.raises(ValueError, match="color network has 7 inputs"):
+        painter.make_nets(network(2, 1), network(7, 3))
+    for name, net in (("h", network(2, 1)), ("c", network(8, 3))):
+        checkpoint.export(tmp_path / f"{name}.npz", net.config, net.variables, net.card)
+    nets = painter.load_nets(tmp_path / "h.npz", tmp_path / "c.npz")
+    assert nets.color_config.outputs == 3
+    with pytest.raises(ValueError, match="PainterConfig.blend = 'none'"):
+        dataclasses.replace(OPTIONS, blend="none")
+    with pytest.raises(ValueError, match="PainterConfig.cells"):
+        dataclasses.replace(OPTIONS, cells=(4, 2))
+    wrong = dataclasses.replace(canvas(), height=jnp.zeros((8, 8)))
+    with pytest.raises(ValueError, match="canvas of height"):
+        painter.paint_stroke(OPTIONS, NETS, wrong, BRUSH, PAINT, line(*PATHS["inside"]))
+    broken = make_stroke([[np.nan, 1.0], [2.0, 2.0]])
+    with pytest.raises(ValueError, match="not finite"):
+        painter.paint_stroke(OPTIONS, NETS, canvas(), BRUSH, PAINT, broken)
+    with pytest.raises(ValueError, match="expected at most 5"):
+        painter.paint_stroke(OPTIONS, NETS, canvas(200, 200), BRUSH, PAINT,
+                             line((1.0, 1.0), (22.0, 22.0)))  # fmt: skip
