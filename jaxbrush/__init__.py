@@ -23,6 +23,12 @@ from jaxbrush.models import Discriminator as Discriminator  # noqa: E402
 from jaxbrush.models import DiscriminatorConfig as DiscriminatorConfig  # noqa: E402
 from jaxbrush.models import Generator as Generator  # noqa: E402
 from jaxbrush.models import GeneratorConfig as GeneratorConfig  # noqa: E402
+from jaxbrush.painter import Nets as Nets  # noqa: E402
+from jaxbrush.painter import PainterConfig as PainterConfig  # noqa: E402
+from jaxbrush.painter import load_nets as load_nets  # noqa: E402
+from jaxbrush.painter import paint_on as paint_on  # noqa: E402
+from jaxbrush.painter import paint_stroke as paint_stroke  # noqa: E402
+from jaxbrush.painter import preview_stroke as preview_stroke  # noqa: E402
 from jaxbrush.raster import Grid as Grid  # noqa: E402
 from jaxbrush.raster import TrajectoryMaps as TrajectoryMaps  # noqa: E402
 from jaxbrush.raster import make_grid as make_grid  # noqa: E402

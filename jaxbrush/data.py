@@ -260,9 +260,21 @@ def network_height(height):
     return _network(height / LEVELS["height"])
 
 
-def network_pressure(pressure):
-    """Pressure in network scale, compressed by a root: most of a stroke is light."""
-    return _network(jnp.sqrt(jnp.clip(pressure / LEVELS["pressure"], 0.0, 1.0)))
+TOUCH = 0.2
+"""Of [0, 1], what the pressure map shows where only the coat of paint touches."""
+
+
+def touched(pairs: dict):
+    """Where bristles came, (n, h, w, 1) bool: also those that touch with their coat alone, whose
+    force is none."""
+    return (jnp.asarray(pairs["time"]) > 0.0) | (jnp.asarray(pairs["pressure"]) > 0.0)
+
+
+def network_pressure(pressure, touch):
+    """Pressure in network scale, compressed by a root: most of a stroke is light. The rest, where
+    nothing came, is told from the lightest touch (`touch`, bool) by a step of `TOUCH`."""
+    share = jnp.sqrt(jnp.clip(pressure / LEVELS["pressure"], 0.0, 1.0))
+    return _network(jnp.where(touch, TOUCH + (1.0 - TOUCH) * share, 0.0))
 
 
 def height_batch(pairs: dict, sweeps: bool = False) -> Batch:
@@ -272,7 +284,11 @@ def height_batch(pairs: dict, sweeps: bool = False) -> Batch:
       sweeps: gives the network the sweep count in place of the pressure (paper Figure 3).
     """
     share = jnp.sqrt(jnp.asarray(pairs["sweeps"]) / LEVELS["sweeps"])
-    hand = _network(share) if sweeps else network_pressure(pairs["pressure"])
+    hand = (
+        _network(share)
+        if sweeps
+        else network_pressure(jnp.asarray(pairs["pressure"]), touched(pairs))
+    )
     inputs = jnp.concatenate([network_height(pairs["height"]), hand], axis=-1)
     return Batch(
         inputs=inputs,
@@ -307,7 +323,7 @@ of the tiny data set, seed 0."""
 
 def preview(pairs: dict) -> dict[str, jax.Array]:
     """The stroke from its maps alone: where bristles came, a film of one thickness and color."""
-    cover = (jnp.asarray(pairs["time"]) > 0.0) | (jnp.asarray(pairs["pressure"]) > 0.0)
+    cover = touched(pairs)
     height = jnp.where(cover, jnp.maximum(pairs["height"], PREVIEW_FILM), pairs["height"])
     return {
         "new_height": height,

@@ -218,7 +218,7 @@ def paint_stroke(
 def paint_patches(options: PainterConfig, nets: Nets, pairs: dict, layout: Layout):
     """`evaluate`, batch by batch of the patches that are there; not jittable."""
     if options.moments == "stroke":
-        return _evaluate(options, nets, pairs, layout.present)
+        return _evaluate(options, nets, pairs, layout)
     count, size = pairs["mask"].shape[0], options.batch
     painted = jnp.zeros((*pairs["mask"].shape[:3], 4))
     for start in range(0, int(jnp.sum(layout.present)), size):

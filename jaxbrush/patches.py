@@ -76,8 +76,9 @@ class Layout:
     corner: (n, 2) first pixel y, x of a patch on the canvas, that of the box where there is none.
     present: (n,) bool. tile: (m, 2) first pixel of a tile, `FAR` where there is none. cell: (m,)
     number of the tile in the box. parts: (m, 4) which patches have a part in a tile: its own, the
-    next along x, along y, along both; n where that one is not painted. enough: () False if n is
-    too small.
+    next along x, along y, along both; n where that one is not painted. tiles: (n, 4) which tiles a
+    patch lies on: before it along both, before it along y, along x, its own; any where that one is
+    not made. enough: () False if n is too small.
     """
 
     corner: jax.Array
@@ -85,6 +86,7 @@ class Layout:
     tile: jax.Array
     cell: jax.Array
     parts: jax.Array
+    tiles: jax.Array
     enough: jax.Array
 
 
@@ -170,6 +172,10 @@ def layout(options: PatchConfig, box: Box, mask, count: int) -> Layout:
     parts = jnp.stack(
         [slot[at[:, 0] + dy, at[:, 1] + dx] for dy in (0, 1) for dx in (0, 1)], axis=1
     )
+    made = jnp.maximum(jnp.cumsum(tile.reshape(-1).astype(jnp.int32)) - 1, 0).reshape(tile.shape)
+    under = jnp.stack(
+        [made[place[:, 0] + dy, place[:, 1] + dx] for dy in (0, 1) for dx in (0, 1)], axis=1
+    )
     there = cell[:, None] >= 0
     first = box.first[None]
     return Layout(
@@ -178,6 +184,7 @@ def layout(options: PatchConfig, box: Box, mask, count: int) -> Layout:
         tile=jnp.where(there, (first + at - 1) * step, FAR),
         cell=jnp.maximum(cell, 0),
         parts=jnp.where(there, parts, count),
+        tiles=jnp.minimum(under, 2 * count + 1),
         enough=needed(options, box, mask) <= count,
     )
 
@@ -296,6 +303,16 @@ def merge(options: PatchConfig, patches, layout: Layout, sharp: bool = False):
     """
     shares = shares_of(options, sharp, patches.dtype)
     return weighted(parts_of(options, patches, layout), shares)[:, :-1, :-1]
+
+
+def recut(options: PatchConfig, tiles, layout: Layout):
+    """Patches (n, size, size, c) of tiles (m, step, step, c); where there is no tile, what is in
+    another."""
+    alone = options.step - options.overlap
+    piece = [tiles[layout.tiles[:, k]] for k in range(4)]
+    above = jnp.concatenate([piece[0][:, alone:, alone:], piece[1][:, alone:]], axis=2)
+    below = jnp.concatenate([piece[2][:, :, alone:], piece[3]], axis=2)
+    return jnp.concatenate([above, below], axis=1)
 
 
 def place(tiles, layout: Layout, field, mask=None):

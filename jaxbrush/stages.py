@@ -216,11 +216,12 @@ def cut(options: PainterConfig, box: Box, drawn: Drawn, canvas: Canvas, layout: 
     }
 
 
-def evaluate(options: PainterConfig, nets: Nets, pairs: dict, present=None):
+def evaluate(options: PainterConfig, nets: Nets, pairs: dict, layout: Layout | None = None):
     """Paints patches: the height network, then the color network on its output.
 
     Args:
-      pairs: n patches from `cut`. present: (n,) bool, which count in moments of the whole stroke.
+      pairs: n patches from `cut`. layout: where they are, for moments of the whole stroke: with it
+        the color network is given the blended height.
 
     Returns:
       (n, size, size, 4) in image scale: height as a share of the largest, sRGB.
@@ -230,8 +231,8 @@ def evaluate(options: PainterConfig, nets: Nets, pairs: dict, present=None):
     if pooled:
         core = jnp.asarray(patches.core(options.patches))[None]
         core = core * jnp.ones((pairs["mask"].shape[0], 1, 1, 1))
-        if present is not None:
-            core = core * present[:, None, None, None].astype(core.dtype)
+        if layout is not None:
+            core = core * layout.present[:, None, None, None].astype(core.dtype)
 
     def run(generator, variables, inputs):
         weights = core
@@ -249,8 +250,12 @@ def evaluate(options: PainterConfig, nets: Nets, pairs: dict, present=None):
         "new_height": before, "new_color": pairs["color"],
     }  # fmt: skip
     height = run(nets.height_config, nets.height, data.height_batch(given).inputs)
+    laid = height
+    if pooled and layout is not None:
+        # Patches see one height wherever they overlap, as if there were one picture.
+        laid = patches.recut(options.patches, blend(options, height, layout), layout)
     # The canvas as it will be: beyond the mask nothing changes.
-    given["new_height"] = before + pairs["mask"] * (level * height - before)
+    given["new_height"] = before + pairs["mask"] * (level * laid - before)
     color = run(nets.color_config, nets.color, data.color_batch(given).inputs)
     return jnp.concatenate([height, color], axis=-1)
 
@@ -305,7 +310,7 @@ def paint_on(
     layout = patches.layout(options.patches, box, drawn.mask[..., 0], sizes.count)
     pairs = cut(options, box, drawn, canvas, layout)
     if options.moments == "stroke" or sizes.count <= options.batch:
-        painted = evaluate(options, nets, pairs, layout.present)
+        painted = evaluate(options, nets, pairs, layout)
     else:
         one = lambda pair: evaluate(  # noqa: E731
             options, nets, jax.tree.map(lambda x: x[None], pair)

@@ -85,6 +85,14 @@ def test_a_patch_is_the_part_of_a_field_below_it():
         np.testing.assert_array_equal(found[k], field[y : y + 28, x : x + 28])
 
 
+def test_recut_is_the_inverse_of_merge():
+    box, field = box_at(1, 0), np.random.default_rng(0).normal(size=(*SHAPE, 2))
+    layout = pick(OPTIONS, box, jnp.ones(SHAPE), COUNT)
+    given = cut(OPTIONS, box, jnp.asarray(field, jnp.float32), layout.corner)
+    again = lambda x: patches.recut(OPTIONS, patches.merge(OPTIONS, x, layout), layout)  # noqa: E731
+    np.testing.assert_allclose(jax.jit(again)(given)[:12], given[:12], atol=1e-6)
+
+
 @pytest.mark.parametrize("low, high, side", [
     ((0, 0), (1, 1), 1), ((15, 15), (17, 17), 2), ((-9, 0), (-4, 3), 1),
     ((-9, 0), (-3, 3), 2), ((3, 3), (16, 40), 4),
