@@ -107,8 +107,9 @@ def _bucket(size: int, buckets) -> int:
 
 
 def _count(options: PainterConfig, need: int) -> int:
-    """Patches are counted in powers of 2, at least a batch."""
-    return max(4, options.batch, 1 << max(need - 1, 0).bit_length())
+    """Patches are counted in powers of 2 and halfway between them, at least a batch."""
+    power = 1 << max(need - 1, 0).bit_length()
+    return max(4, options.batch, 3 * power // 4 if need <= 3 * power // 4 else power)
 
 
 def _padded(stroke: Stroke) -> Stroke:

@@ -41,7 +41,7 @@ class PainterConfig:
     pixel: side of a pixel of the canvas [mm], that of the training pairs. brush: how bristles are
     simulated. patches: how a stroke is cut. blend: how patches become one picture, one of BLENDS.
     moments: "patch", each normalised by its own moments; or "stroke", by those of all of its
-    stroke, which are then painted at once. edge: of soft maps [mm], or None for exact ones.
+    stroke, which are then painted at once, without a seam. edge: of soft maps [mm], or None for exact ones.
     stamps: buckets of stamps; a stroke that needs more gets the most, further
     apart. cells: buckets of the side of a box, in patches. batch: patches that the networks are
     given at once.
@@ -50,8 +50,8 @@ class PainterConfig:
     pixel: float = 0.125
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
     patches: PatchConfig = PatchConfig()  # noqa: RUF009
-    blend: str = "feather"
-    moments: str = "patch"
+    blend: str = "cut"
+    moments: str = "stroke"
     edge: float | None = None
     stamps: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
     cells: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)

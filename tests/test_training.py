@@ -105,7 +105,7 @@ def test_errors_of_known_pictures():
 
 
 def test_color_errors_tell_false_colors():
-    pairs = toy(2, side=16, kind="color")
+    pairs = toy(2, side=64, kind="color")
     truth = np.asarray(pairs.batch.target)
     same = evaluation.errors("color", truth, pairs.batch, SCALE)
     # Everything here is gray; what lies in between is in the hull.
