@@ -41,10 +41,10 @@ class PainterConfig:
     pixel: side of a pixel of the canvas [mm], that of the training pairs. brush: how bristles are
     simulated. patches: how a stroke is cut. blend: how patches become one picture, one of BLENDS.
     moments: "patch", each normalised by its own moments; or "stroke", by those of all of its
-    stroke, which are then painted at once, without a seam. edge: of soft maps [mm], or None for exact ones.
-    stamps: buckets of stamps; a stroke that needs more gets the most, further
-    apart. cells: buckets of the side of a box, in patches. batch: patches that the networks are
-    given at once.
+    stroke, which are then painted at once and show no seam side by side ("cut"). edge: of soft maps
+    [mm], or None for exact ones. stamps: buckets of stamps; a stroke that needs more gets the most,
+    further apart. cells: buckets of the side of a box, in patches. batch: patches that the networks
+    are given at once, where moments allow.
     """
 
     pixel: float = 0.125
