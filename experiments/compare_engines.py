@@ -106,8 +106,7 @@ def errors(found: Canvas, true: Canvas) -> dict:
 
 
 def warm(spent: list[dict]) -> np.ndarray:
-    """Milliseconds a stroke; the least of the strokes of a shape would be fairer to compilation,
-    the median of all but those ten times slower than it is as good."""
+    """Milliseconds a stroke, without those that were compiled for: ten times slower than others."""
     took = 1e3 * np.asarray([sum(s.values()) for s in spent])
     return took[took < 10.0 * np.median(took)]
 
@@ -250,7 +249,7 @@ def main(options: Config) -> None:
         print_table(f"{name}: ms a stroke", ["stage", "median", "95 %", "worst", "first"], rows)
 
     text = ", ".join(f"{name} {value:.1f}" for name, value in quantiles.items())
-    console.print(f"Preview after the last sample of a frame, networks at work [ms]: {text}.")
+    console.print(f"Preview after the last sample of a frame, networks at work, ms: {text}.")
 
 
 if __name__ == "__main__":

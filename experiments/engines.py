@@ -32,7 +32,7 @@ from jaxbrush.paint import (
 from jaxbrush.raster.grid import bucket
 from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent, to_stroke
 from jaxbrush.session import Session as Live
-from jaxbrush.stylus import Stroke, resample, stamps_needed, transform
+from jaxbrush.stylus import Stroke, resample, stamps_needed
 
 BRUSH = {
     "shape": "flat", "width": 3.0, "thickness": 0.9, "length": 15.0, "depth": 3.75, "load": 0.85,
@@ -135,10 +135,12 @@ def _clock(stages: dict, name: str, call):
     return out
 
 
-def stamps_of(stroke: Stroke, spacing: float, depth) -> int:
-    """Bucketed number of stamps of a stroke."""
-    need = int(stamps_needed(stroke, spacing, np.inf, depth))
-    return bucket(max(2, need))
+_needed = jax.jit(stamps_needed)
+
+
+def _moved(brush, stroke, spacing, stamps):
+    stroke = resample(stroke, stamps, spacing, np.inf, brush.press_depth)
+    return rollout(BrushConfig(), brush, stroke)
 
 
 class Simulator:
@@ -156,7 +158,7 @@ class Simulator:
         size = tuple(n + 2 * self.margin for n in inner)
         self.paint_canvas = empty_canvas(self.config, size)
         self.tooth = jnp.asarray(weave(size, config.pixel), float)
-        self._move, self._lay = jax.jit(rollout, static_argnums=0), jax.jit(paint_stroke)
+        self._move, self._lay = jax.jit(_moved, static_argnums=3), jax.jit(paint_stroke)
 
     def paint(self, deed: Deed) -> dict[str, float]:
         """Paints a stroke; seconds of each stage."""
@@ -165,10 +167,11 @@ class Simulator:
         if self.bristles is not None and self.bristles < count:
             brush, paint, count = fewer(deed, self.bristles)
         edge = self.margin * self.config.pixel
-        moved = transform(deed.stroke, translate=(edge, edge))
-        stamps = stamps_of(deed.stroke, self.spacing, brush.press_depth)
+        stroke = painter.padded(deed.stroke)
+        stroke = dataclasses.replace(stroke, position=stroke.position + np.float32(edge))
+        stamps = bucket(max(2, int(_needed(stroke, self.spacing, np.inf, brush.press_depth))))
         track = _clock(stages, "brush", lambda: self._move(
-            BrushConfig(), brush, resample(moved, stamps, self.spacing, np.inf, brush.press_depth)
+            brush, stroke, self.spacing, stamps
         ))  # fmt: skip
         loaded = load_brush(
             self.config, paint, count, deed.load, shares(deed.color, np.asarray(self.palette))

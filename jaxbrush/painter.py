@@ -112,7 +112,7 @@ def _count(options: PainterConfig, need: int) -> int:
     return max(4, options.batch, 3 * power // 4 if need <= 3 * power // 4 else power)
 
 
-def _padded(stroke: Stroke) -> Stroke:
+def padded(stroke: Stroke) -> Stroke:
     """A stroke with a power of 2 of samples, by numpy: each length would compile anew."""
     have = stroke.time.shape[0]
     if not all(np.all(np.isfinite(np.asarray(x))) for x in jax.tree.leaves(stroke)):
@@ -126,7 +126,7 @@ def _padded(stroke: Stroke) -> Stroke:
 
 def _begin(options: PainterConfig, brush: BrushParams, stroke: Stroke):
     """Track and touches of a stroke, stamps in a bucket; not jittable."""
-    stroke = _padded(stroke)
+    stroke = padded(stroke)
     stamps = _bucket(int(_needed_stamps(options, brush, stroke)), options.stamps)
     return _trace(options, brush, _place_stamps(options, brush, stroke, stamps=stamps))
 
