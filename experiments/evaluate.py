@@ -1,7 +1,7 @@
 """Errors of exported networks on the test pairs of a data set, beside the baselines.
 
 python -m experiments.evaluate                                # what ships in checkpoints/
-python -m experiments.evaluate --weights results/train_height/height.npz --preset tiny
+python -m experiments.evaluate --preset tiny --weights results/train_height/height.npz
 python -m experiments.evaluate --weights checkpoints/color.npz --height checkpoints/height.npz
 """
 
@@ -34,8 +34,9 @@ class Config:
     height: Path | None = None
     """A height network whose picture the color networks are given in place of the true height, as
     in use."""
-    preset: Literal["tiny", "cpu", "small", "paper"] = "tiny"
-    """Data set, made if it is not there."""
+    preset: Literal["tiny", "cpu", "small", "paper"] = "cpu"
+    """Data set, made if it is not there. What ships has learned from `cpu`, whose training pairs
+    hold all of `tiny`, its test pairs too."""
     data: Path | None = None
     """Folder of the data set [default: results/data_<preset>]."""
     split: Literal["test", "train"] = "test"

@@ -75,7 +75,9 @@ PRESETS = {
         PairConfig(size=512, strokes=5, stamps=512, bristles=256), train=2000, test=200, shard=5
     ),
 }
-"""tiny: 160 + 40 pairs of 128 x 128. cpu: 800 + 112 such, what two cores make in half an hour.
+"""tiny: 160 + 40 pairs of 128 x 128. cpu: 800 + 112 such, what two cores make in half an hour;
+its first training pairs are those of tiny, the test pairs of tiny included, so judge a network that
+learned from it by its own test pairs only.
 small: 1,000 + 125 of 256 x 256. paper: 10,000 + 1,000 of 512 x 512, as many as the paper's."""
 
 
