@@ -35,8 +35,7 @@ class Config:
     """A height network whose picture the color networks are given in place of the true height, as
     in use."""
     preset: Literal["tiny", "cpu", "small", "paper"] = "cpu"
-    """Data set, made if it is not there. What ships has learned from `cpu`, whose training pairs
-    hold all of `tiny`, its test pairs too."""
+    """Data set, made if it is not there."""
     data: Path | None = None
     """Folder of the data set [default: results/data_<preset>]."""
     split: Literal["test", "train"] = "test"

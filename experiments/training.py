@@ -17,6 +17,7 @@ from experiments import evaluation
 from experiments.common import console, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import checkpoint
+from jaxbrush.data import recolored
 from jaxbrush.models import DiscriminatorConfig, GeneratorConfig
 from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
 
@@ -66,6 +67,8 @@ class Options:
     """Updates between lines of metrics.jsonl; each is a mean over them."""
     turns: bool = True
     """Mirrors and turns pairs at random, by quarters."""
+    recolor: bool = True
+    """Color: changes the colors of every pair at random, as paint allows (`data.recolored`)."""
     resident: float = 4.0
     """Training pairs of up to so many GB are kept on the device, more are streamed."""
     seed: int = 0
@@ -119,7 +122,11 @@ def turned(batch, which):
     return jax.lax.switch(which, every, batch)
 
 
-def make_batches(pairs: Pairs, options: Options):
+RECOLOR = 0.7
+"""Largest change of the logarithm of absorption over scattering, in each channel."""
+
+
+def make_batches(pairs: Pairs, options: Options, recolor: bool = False):
     """`batches(step) -> (Batch on the device, numbers of its pairs)`; the same whether all pairs
     are on the device or not."""
     device = jax.devices()[0]
@@ -128,6 +135,7 @@ def make_batches(pairs: Pairs, options: Options):
     gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
     # The paint knows no direction, so every pair is worth eight.
     turn = jax.jit(turned)
+    change = jax.jit(recolored)
 
     def batches(step: int):
         index = indices(options.seed, step, options.batch, len(pairs))
@@ -138,6 +146,11 @@ def make_batches(pairs: Pairs, options: Options):
         if options.turns:
             which = np.random.default_rng((options.seed, step)).integers(8)
             found = turn(found, jax.device_put(np.int32(which), device))
+        if recolor:
+            draw = np.random.default_rng((options.seed, step, 1))
+            channels = draw.permutation(3).astype(np.int32)
+            scale = np.exp(draw.uniform(-RECOLOR, RECOLOR, 3)).astype(np.float32)
+            found = change(found, *jax.device_put((channels, scale), device))
         return found, index
 
     return batches
@@ -230,7 +243,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
     chosen = train_config(options, kind)
     init, update = make_train(chosen)
     params = make_params(options.l1, options.gan, options.rate, options.discriminator_rate)
-    batches = make_batches(train, options)
+    batches = make_batches(train, options, recolor=kind == "color" and options.recolor)
     held = jax.device_put(held)
     seconds = np.inf if options.minutes is None else 60.0 * options.minutes
     last_step = np.inf if options.steps is None else options.steps

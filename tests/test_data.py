@@ -4,13 +4,16 @@ import dataclasses
 import json
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from experiments import evaluate
 from jaxbrush import checkpoint, data, pairs
+from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.paint import PaintConfig
+from jaxbrush.train import Batch
 
 SMALL = pairs.PairConfig(
     size=48, strokes=2, stamps=24, bristles=24,
@@ -165,3 +168,44 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     (tmp_path / "broken.npz").write_bytes(b"weights")
     with pytest.raises(SystemExit, match="broken.npz"):
         evaluate.main(evaluate.Config((tmp_path / "broken.npz",), data=folder, out=tmp_path))
+
+
+def test_recolored_pairs_are_what_other_paint_would_have_given():
+    rng = np.random.default_rng(0)
+    paint = rng.uniform(0.1, 0.3, (6, 3, 16, 16)).astype(np.float32)
+    palette = rng.uniform(0.03, 0.9, (3, 3)).astype(np.float32)
+    channels, scale = np.array([2, 0, 1]), np.array([1.7, 0.6, 1.0], np.float32)
+
+    def seen(palette):
+        thick = flatten(jnp.asarray(paint), 0.1, jnp.asarray(palette), mixing="subtractive")
+        return 2.0 * to_srgb(thick.color) - 1.0
+
+    def change(bright):
+        ratio = scale * (1.0 - bright) ** 2 / (2.0 * bright)
+        return (1.0 + ratio - np.sqrt(ratio**2 + 2.0 * ratio))[:, channels]
+
+    target = seen(palette)[None]
+    stroke = target.at[:, :4].set(-1.0)  # no stroke there
+    rest = jnp.zeros((1, 16, 16, 2))
+    batch = Batch(jnp.concatenate([target, stroke, rest], -1), target, rest[..., :1])
+    found = data.recolored(batch, jnp.asarray(channels, jnp.int32), jnp.asarray(scale))
+    want = seen(change(palette))[None]
+    np.testing.assert_allclose(found.target, want, atol=1e-3)
+    np.testing.assert_allclose(found.inputs[..., :3], want, atol=1e-3)
+    np.testing.assert_array_equal(found.inputs[:, :4, :, 3:6], -1.0)
+    np.testing.assert_allclose(found.inputs[:, 4:, :, 3:6], want[:, 4:], atol=1e-3)
+    np.testing.assert_array_equal(found.inputs[..., 6:], rest)
+    # The naive way, the same factor on linear RGB, is not what that paint gives.
+    naive = 2.0 * to_srgb(scale * np.asarray(from_srgb(0.5 * (target + 1.0)))) - 1.0
+    same = seen(np.clip(scale * palette, 0.0, 1.0))[None]
+    assert np.abs(naive - same).max() > 0.05
+    nothing = data.recolored(batch, jnp.arange(3, dtype=jnp.int32), jnp.ones(3))
+    np.testing.assert_allclose(nothing.inputs, batch.inputs, atol=2e-3)
+    np.testing.assert_array_equal(nothing.mask, batch.mask)
+
+
+def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
+    found = data.load(folder)
+    alone = pairs.canvas_pairs(SMALL, SEED, OPTIONS.train)[0]  # the next training canvas
+    stored = found.take("test", [0])
+    assert np.abs(stored["new_height"][0, ..., 0] - alone.new_height).max() > 0.02
