@@ -16,7 +16,7 @@ from rich.progress import track
 
 from experiments import engines, paint_scenes, paint_session
 from experiments.common import console, print_table, results_folder, save_figure, write_run
-from jaxbrush import painter, patches, stages
+from jaxbrush import painter, patches, seams, stages
 from jaxbrush.canvas import blank
 from jaxbrush.recordings import BrushEvent
 
@@ -70,7 +70,7 @@ def seam_of(options: stages.PainterConfig, watched: dict, before, box) -> np.nda
     return found[found > 0.0]
 
 
-_seam = jax.jit(patches.seam)
+_seam = jax.jit(seams.seam)
 
 
 def main(options: Config) -> None:
@@ -82,8 +82,8 @@ def main(options: Config) -> None:
     strokes = deeds()[: 1 if options.quick else None]
     results, pictures = {}, {}
     for moments, blend in track(WAYS, "blends", console=console):
-        how = painter.PainterConfig(moments=moments, blend=blend)
-        seams, took = [np.zeros(1)], []
+        how = painter.PainterConfig(moments=moments, blend=blend, sides=())
+        found, took = [np.zeros(1)], []
         for timed in (False, True):
             canvas = blank(SHAPE)
             for deed in strokes:
@@ -98,9 +98,9 @@ def main(options: Config) -> None:
                     took.append(1e3 * (time.perf_counter() - start))
                 else:
                     box = painter.place(how, SHAPE, watched["brush"][1])
-                    seams.append(seam_of(how, watched, canvas, box))
+                    found.append(seam_of(how, watched, canvas, box))
                 canvas = after
-        every = np.concatenate(seams)
+        every = np.concatenate(found)
         results[NAMES[moments, blend]] = {
             "largest": float(every.max()), "p99": float(np.percentile(every, 99.0)),
             "milliseconds": float(np.median(took)),

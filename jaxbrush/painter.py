@@ -3,7 +3,8 @@
 `paint_stroke` picks the sizes of a stroke and runs its stages one by one. Sizes are bucketed: for s
 buckets of stamps, b of boxes and n of patch counts in use, any number of strokes on canvases of one
 size compiles `trace` s times, `draw` at most s * b times, `cut` and `lay` at most b * n times, and
-the networks once. What is compiled besides is small.
+the networks n times. A stroke painted in one piece has in place of box and count a rectangle, of r
+shapes. What is compiled besides is small.
 """
 
 import jax
@@ -14,7 +15,7 @@ from jaxbrush import checkpoint, patches
 from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
 from jaxbrush.pairs import REACH
-from jaxbrush.patches import Box, Layout
+from jaxbrush.patches import Box, Layout, Rect
 from jaxbrush.raster import trajectory_maps
 from jaxbrush.stages import Nets as Nets
 from jaxbrush.stages import PainterConfig as PainterConfig
@@ -74,10 +75,14 @@ def _needed(options, brush, stroke):
 
 def _draw_and_count(options, box, shape, track, color):
     drawn = draw(options, box, shape, track, color)
+    if isinstance(box, Rect):
+        return drawn, jnp.any(drawn.mask > 0.0).astype(jnp.int32)
     return drawn, patches.needed(options.patches, box, drawn.mask[..., 0])
 
 
 def _cut_some(options, box, drawn, canvas, count):
+    if isinstance(box, Rect):
+        return box, cut(options, box, drawn, canvas, box)
     layout = patches.layout(options.patches, box, drawn.mask[..., 0], count)
     return layout, cut(options, box, drawn, canvas, layout)
 
@@ -150,12 +155,26 @@ def reached(shape, bounds) -> tuple[slice, slice] | None:
     return slice(int(low[0]), int(high[0])), slice(int(low[1]), int(high[1]))
 
 
-def place(options: PainterConfig, shape, bounds) -> Box | None:
-    """The box of what a stroke may change on a canvas, None if that is nothing; not jittable."""
+MARGIN = 8
+"""Pixels round the mask of a stroke that is painted in one piece."""
+
+
+def place(options: PainterConfig, shape, bounds) -> Box | Rect | None:
+    """The box of what a stroke may change on a canvas (h, w), or its rectangle where that is less
+    work; None if it changes nothing. Not jittable."""
     there = reached(shape, bounds)
     if there is None:
         return None
     low, high = ([getattr(s, end) for s in there] for end in ("start", "stop"))
+    if options.moments == "stroke":
+        rect = patches.rect_of(low, high, MARGIN, shape, options.sides)
+        if rect is not None:
+            bounds = np.asarray(bounds)
+            first = np.maximum(bounds[:, :2] - REACH, 0.0).astype(int)
+            last = np.minimum(bounds[:, 2:] + REACH, np.asarray(shape, float)).astype(int)
+            count = _count(options, patches.patches_along(options.patches, first, last))
+            if rect.sides[0] * rect.sides[1] <= count * options.patches.size**2:
+                return rect
     return patches.box_of(options.patches, np.asarray(low), np.asarray(high), options.cells)
 
 
@@ -170,6 +189,8 @@ def plan(options: PainterConfig, canvas: Canvas, brush: BrushParams, stroke: Str
     box = place(options, shape, bounds)
     if box is None:
         return None
+    if isinstance(box, Rect):
+        return Sizes(track.time.shape[0], sides=box.sides), box.corner
     _, need = _draw(options, box, shape, track, jnp.zeros(3))
     sizes = Sizes(track.time.shape[0], box.cells, _count(options, int(need)))
     return sizes, box.first
@@ -216,8 +237,8 @@ def paint_stroke(
     return canvas
 
 
-def paint_patches(options: PainterConfig, nets: Nets, pairs: dict, layout: Layout):
-    """`evaluate`, batch by batch of the patches that are there; not jittable."""
+def paint_patches(options: PainterConfig, nets: Nets, pairs: dict, layout: Layout | Rect):
+    """`evaluate`, batch by batch of the patches that are there, layout as there; not jittable."""
     if options.moments == "stroke":
         return _evaluate(options, nets, pairs, layout)
     count, size = pairs["mask"].shape[0], options.batch

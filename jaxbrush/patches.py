@@ -70,6 +70,18 @@ class Box:
 
 
 @state
+class Rect:
+    """A stroke's rectangle, painted in one piece: what takes the place of a Box where that is less
+    work.
+
+    corner: (2,) int, its first pixel y, x on the canvas. sides: (h, w) [pixels], static.
+    """
+
+    corner: jax.Array
+    sides: tuple[int, int] = dataclasses.field(metadata={"static": True})
+
+
+@state
 class Layout:
     """Which patches and tiles of a box a stroke needs, up to n patches and m = 2 n + 2 tiles.
 
@@ -112,14 +124,58 @@ def box_of(options: PatchConfig, low, high, buckets) -> Box:
     )
 
 
-def corner_of(options: PatchConfig, box: Box):
+def rect_of(low, high, margin: int, canvas, buckets) -> Rect | None:
+    """The bucketed rectangle that holds the pixels from `low` to before `high` and, where the
+    canvas has them, `margin` more on each side; None if it is larger than the buckets. Not
+    jittable.
+
+    Args:
+      low, high: (2,) int y, x on the canvas. canvas: (h, w). buckets: sides, rising [pixels].
+    """
+    canvas = np.asarray(canvas, int)
+    low = np.maximum(np.asarray(low, int) - margin, 0)
+    high = np.minimum(np.asarray(high, int) + margin, canvas)
+    sides = [next((b for b in buckets if n <= b), None) for n in high - low]
+    if None in sides:
+        return None
+    room = canvas - sides
+    corner = (low + high - sides) // 2
+    # Inside the canvas; where it is smaller, about its middle.
+    corner = np.where(room >= 0, np.clip(corner, 0, np.maximum(room, 0)), room // 2)
+    return Rect(corner=jnp.asarray(corner, jnp.int32), sides=tuple(sides))
+
+
+def patches_along(options: PatchConfig, low, high) -> int:
+    """How many patches hold pixels of some rectangles in their cores; not jittable.
+
+    Args:
+      low, high: (t, 2) int, first pixel y, x of a rectangle and the one after its last.
+    """
+    before = options.overlap - options.lead
+    spans = np.concatenate([low + before, high - 1 + before], axis=1) // options.step
+    spans = np.unique(spans[np.all(high > low, axis=1)], axis=0)
+    if not len(spans):
+        return 0
+    spans -= np.tile(spans[:, :2].min(0), 2)
+    hit = np.zeros(spans[:, 2:].max(0) + 1, bool)
+    for top, left, bottom, right in spans:
+        hit[top : bottom + 1, left : right + 1] = True
+    return int(hit.sum())
+
+
+def corner_of(options: PatchConfig, box: Box | Rect):
     """(2,) first pixel y, x of a box on the canvas."""
+    if isinstance(box, Rect):
+        return box.corner
     return box.first * options.step - options.overlap
 
 
-def grid_of(options: PatchConfig, box: Box, pixel: float) -> Grid:
+def grid_of(options: PatchConfig, box: Box | Rect, pixel: float) -> Grid:
     """The pixels of all patches of a box."""
-    shape = tuple(n * options.step + options.overlap for n in box.cells)
+    if isinstance(box, Rect):
+        shape = box.sides
+    else:
+        shape = tuple(n * options.step + options.overlap for n in box.cells)
     return Grid(shape=shape, origin=corner_of(options, box)[::-1].astype(float) * pixel,
                 pixel=pixel)  # fmt: skip
 
@@ -207,24 +263,23 @@ def cut(options: PatchConfig, box: Box, field, corner):
     return jax.vmap(lambda y, x: jax.lax.dynamic_slice(field, (y, x, 0), size))(y, x)
 
 
-def pixels(corner, side: int):
-    """Rows (n, side, 1) and columns (n, 1, side) of squares at `corner` (n, 2)."""
-    along = jnp.arange(side, dtype=jnp.int32)
-    rows = corner[:, :1] + along[None]
-    columns = corner[:, 1:] + along[None]
+def pixels(corner, sides):
+    """Rows (n, p, 1) and columns (n, 1, q) of rectangles of `sides` (p, q) at `corner` (n, 2)."""
+    rows = corner[:, :1] + jnp.arange(sides[0], dtype=jnp.int32)[None]
+    columns = corner[:, 1:] + jnp.arange(sides[1], dtype=jnp.int32)[None]
     return rows[:, :, None], columns[:, None, :]
 
 
-def cut_canvas(field, corner, side: int):
-    """Squares of a field of the whole canvas, which goes on beyond its edges as it is there.
+def cut_canvas(field, corner, sides):
+    """Rectangles of a field of the whole canvas, which goes on beyond its edges as it is there.
 
     Args:
-      field: (h, w) or (h, w, c). corner: (n, 2) int y, x, anywhere. side: of a square [pixels].
+      field: (h, w) or (h, w, c). corner: (n, 2) int y, x, anywhere. sides: (p, q) [pixels].
 
     Returns:
-      (n, side, side) or (n, side, side, c).
+      (n, p, q) or (n, p, q, c).
     """
-    rows, columns = pixels(corner, side)
+    rows, columns = pixels(corner, sides)
     return field[jnp.clip(rows, 0, field.shape[0] - 1), jnp.clip(columns, 0, field.shape[1] - 1)]
 
 
@@ -315,55 +370,22 @@ def recut(options: PatchConfig, tiles, layout: Layout):
     return jnp.concatenate([above, below], axis=1)
 
 
-def place(tiles, layout: Layout, field, mask=None):
+def tile_of(layout: Layout | Rect):
+    """(m, 2) first pixel of each tile."""
+    return layout.corner[None] if isinstance(layout, Rect) else layout.tile
+
+
+def place(tiles, layout: Layout | Rect, field, mask=None):
     """Lays tiles over a field of the whole canvas; what lies off it is dropped.
 
     Args:
-      tiles: (m, step, step) or (m, step, step, c). field: (h, w) or (h, w, c). mask: (m, step,
-        step) bool, what is laid; the rest of the field keeps its bits.
+      tiles: (m, step, step) or (m, step, step, c); of a Rect one, of its sides. field: (h, w) or
+        (h, w, c). mask: (m, step, step) bool, what is laid; the rest of the field keeps its bits.
     """
-    rows, columns = pixels(layout.tile, tiles.shape[1])
+    rows, columns = pixels(tile_of(layout), tiles.shape[1:3])
     # A negative index would count from the end.
     keep = (rows >= 0) & (columns >= 0) & (columns < field.shape[1])
     if mask is not None:
         keep = keep & mask
     rows = jnp.where(keep, rows, field.shape[0])
     return field.at[rows, jnp.maximum(columns, 0)].set(tiles, mode="drop")
-
-
-def seam(options: PatchConfig, patches, layout: Layout, merged, mask=None):
-    """How far steps from pixel to pixel of a merged picture are from what any patch says.
-
-    A step is no seam where it lies between the steps of the patches that hold both its pixels, be
-    they ever so rough; what exceeds them was made by the blend.
-
-    Args:
-      patches: (n, size, size, c). merged: (h, w, c), a picture of the whole canvas. mask: (h, w),
-        of the pixels that count, or None for all.
-
-    Returns:
-      (2, h, w) from a pixel to the one below it, and to the one to its right; the largest of all
-      channels, in the scale of the patches; 0 where no patch holds both.
-    """
-    h, w, c = merged.shape
-    inside = jnp.ones((h, w), bool) if mask is None else mask > 0.0
-    rows, columns = pixels(layout.corner, options.size)
-    rows, columns = jnp.broadcast_arrays(rows, columns)
-    there = (rows >= 0) & (columns >= 0) & layout.present[:, None, None]
-    rows, columns = jnp.where(there, rows, h), jnp.maximum(columns, 0)
-    found = []
-    for axis in (0, 1):
-        end = [(0, 0)] * 2
-        end[axis] = (0, 1)
-        step = jnp.pad(jnp.diff(merged, axis=axis), [*end, (0, 0)])
-        both = inside & jnp.pad(jax.lax.slice_in_dim(inside, 1, None, axis=axis), end)
-        short = [slice(None)] * 3
-        short[axis + 1] = slice(None, -1)
-        at = (rows[tuple(short)], columns[tuple(short)])
-        steps = jnp.diff(patches, axis=axis + 1)
-        low = jnp.full((h, w, c), jnp.inf).at[at].min(steps, mode="drop")
-        high = jnp.full((h, w, c), -jnp.inf).at[at].max(steps, mode="drop")
-        beyond = jnp.maximum(jnp.maximum(step - high, low - step), 0.0)
-        known = jnp.isfinite(low) & both[..., None]
-        found.append(jnp.max(jnp.where(known, beyond, 0.0), axis=-1))
-    return jnp.stack(found)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbrush import checkpoint, data, painter, patches, stages
+from jaxbrush import checkpoint, data, painter, patches, seams, stages
 from jaxbrush.brush import BrushConfig, make_brush
 from jaxbrush.canvas import Canvas, to_srgb
 from jaxbrush.metrics import image_scale
@@ -102,6 +102,56 @@ def test_only_the_mask_is_painted(name):
     stroke = line(*PATHS[name], 1 if name == "one sample" else 9)
     found = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
     assert check_painted(found, before, stroke).any()
+
+
+WHOLE = dataclasses.replace(OPTIONS, moments="stroke", blend="cut", sides=(64,))
+_paint_on = jax.jit(painter.paint_on, static_argnums=(0, 1))
+
+
+@pytest.mark.parametrize("name", PATHS)
+def test_a_stroke_in_one_piece(name):
+    before = canvas()
+    stroke = jax.tree.map(jnp.asarray, line(*PATHS[name], 9))
+    sizes, first = painter.plan(WHOLE, before, BRUSH, stroke)
+    assert sizes.sides == (64, 64) and sizes.count == 0
+    found = painter.paint_stroke(WHOLE, NETS, before, BRUSH, PAINT, stroke)
+    assert check_painted(found, before, stroke).any()
+    again, ok = _paint_on(WHOLE, sizes, NETS, before, BRUSH, jnp.asarray(PAINT), stroke, first)
+    assert ok
+    np.testing.assert_allclose(again.color, found.color, atol=2e-5)
+    np.testing.assert_allclose(again.height, found.height, atol=2e-5)
+
+
+def test_a_canvas_smaller_than_the_rectangle():
+    before, stroke = canvas(20, 24), line((-0.5, 1.0), (2.0, 1.5))
+    found = painter.paint_stroke(WHOLE, NETS, before, BRUSH, PAINT, stroke)
+    assert check_painted(found, before, stroke).any()
+
+
+def test_one_piece_where_it_is_less_work():
+    """A long diagonal is cut into patches, and so is what no rectangle holds."""
+    place = lambda stroke, shape, options: painter.place(  # noqa: E731
+        options, shape, painter._begin(options, BRUSH, stroke)[1]
+    )
+    wide = dataclasses.replace(
+        WHOLE, patches=patches.PatchConfig(48, 16), stamps=(512,), cells=(16,), sides=(96, 448)
+    )
+    straight, slanted = line((2.0, 9.0), (48.0, 9.0)), line((2.0, 2.0), (48.0, 48.0))
+    assert place(straight, (400, 400), wide).sides == (96, 448)
+    assert isinstance(place(slanted, (400, 400), wide), patches.Box)
+    few = dataclasses.replace(wide, sides=(96, 128))
+    assert isinstance(place(straight, (400, 400), few), patches.Box)
+
+
+def test_the_stroke_counts_no_more_than_in_training():
+    rng = np.random.default_rng(0)
+    for share in (0.0, 0.1, 0.6, 1.0):
+        mask = jnp.asarray(rng.uniform(size=(1, 40, 40, 1)) < share, jnp.float32)
+        weights = np.asarray(stages.balanced(mask))
+        assert np.all(np.isfinite(weights)) and weights.min() >= 0.0 and weights.max() > 0.0
+        counts = float(np.sum(weights * np.asarray(mask)) / weights.sum())
+        want = min(float(mask.mean()), stages.SHARE) if share < 1.0 else 1.0
+        assert counts == pytest.approx(want, abs=1e-4)
 
 
 def test_strokes_that_touch_nothing_change_nothing():
@@ -278,7 +328,7 @@ def test_moments_of_the_whole_stroke_leave_no_seam():
         painted = stages.evaluate(own, NETS, pairs, layout)
         found = patches.place(stages.blend(own, painted, layout), layout, jnp.zeros((90, 90, 4)))
         held = drawn.mask[40:130, 40:130, 0]
-        return jnp.max(patches.seam(own.patches, painted, layout, found, held))
+        return jnp.max(seams.seam(own.patches, painted, layout, found, held))
 
     whole, apart = float(seam("stroke")), float(seam("patch"))
     print("seam:", whole, apart)
@@ -328,6 +378,8 @@ def test_arguments_are_checked(tmp_path):
         dataclasses.replace(OPTIONS, blend="none")
     with pytest.raises(ValueError, match="PainterConfig.cells"):
         dataclasses.replace(OPTIONS, cells=(4, 2))
+    with pytest.raises(ValueError, match="PainterConfig.sides"):
+        dataclasses.replace(OPTIONS, sides=(64, 30))
     wrong = dataclasses.replace(canvas(), height=jnp.zeros((8, 8)))
     with pytest.raises(ValueError, match="canvas of height"):
         painter.paint_stroke(OPTIONS, NETS, wrong, BRUSH, PAINT, line(*PATHS["inside"]))

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbrush import patches
+from jaxbrush import patches, seams
 from jaxbrush.models import Generator, GeneratorConfig
 
 OPTIONS = patches.PatchConfig(size=28, overlap=8)
@@ -61,7 +61,9 @@ def test_cut_and_merge_give_the_picture_back():
     box, mask = box_at(0, 0), np.zeros(SHAPE, np.float32)
     mask[OVER : OVER + 50, OVER : OVER + 66] = 1.0
     layout = pick(OPTIONS, box, jnp.asarray(mask), COUNT)
-    given = jax.jit(patches.cut_canvas, static_argnums=2)(canvas, layout.corner, OPTIONS.size)
+    given = jax.jit(patches.cut_canvas, static_argnums=2)(
+        canvas, layout.corner, (OPTIONS.size,) * 2
+    )
     k = 5
     y, x = np.asarray(layout.corner[k])
     rows, columns = np.clip(np.arange(y, y + 28), 0, 49), np.clip(np.arange(x, x + 28), 0, 69)
@@ -149,7 +151,7 @@ def test_patches_against_the_whole(norm):
             found = patches.place(tiles, layout, jnp.zeros((112, 112, 1)))
             at = options.overlap
             held = jnp.asarray(mask)[at:, at:]
-            seam = patches.seam(options, painted, layout, found, held)
+            seam = seams.seam(options, painted, layout, found, held)
             off = held * jnp.abs(found[..., 0] - whole[at:, at:, 0])
             result.append((jnp.max(seam), jnp.max(off)))
         return result
@@ -163,3 +165,39 @@ def test_patches_against_the_whole(norm):
         assert seam < 1e-4 and off < 1e-4
     else:
         assert seam > 2.0 / 255.0
+
+
+def test_rectangles_hold_their_stroke_and_its_margin():
+    rng = np.random.default_rng(1)
+    buckets = (16, 24, 32, 48, 64)
+    for _ in range(200):
+        canvas = rng.integers(8, 80, 2)
+        ends = np.sort(rng.integers(0, canvas, (2, 2)), axis=0)
+        low, high = ends[0], ends[1] + 1
+        rect = patches.rect_of(low, high, 4, canvas, buckets)
+        if rect is None:
+            assert np.max(np.minimum(high + 4, canvas) - np.maximum(low - 4, 0)) > buckets[-1]
+            continue
+        corner, sides = np.asarray(rect.corner), np.asarray(rect.sides)
+        assert np.all(np.isin(sides, buckets))
+        assert np.all(corner <= np.maximum(low - 4, 0))
+        assert np.all(corner + sides >= np.minimum(high + 4, canvas))
+        inside = sides <= canvas
+        assert np.all((corner >= 0)[inside]) and np.all((corner + sides <= canvas)[inside])
+
+
+def test_patches_are_counted_from_where_the_brush_goes():
+    """As many as the layout wants of a mask of the same rectangles."""
+    rng = np.random.default_rng(2)
+    box = box_at(0, 0)
+    origin = np.asarray(patches.corner_of(OPTIONS, box))
+    cores = OPTIONS.step * np.asarray(box.cells)
+    for _ in range(20):
+        low = origin + OPTIONS.lead + rng.integers(0, cores - 12, (5, 2))
+        high = low + rng.integers(-2, 12, (5, 2))
+        mask = np.zeros(SHAPE, np.float32)
+        for (y, x), (bottom, right) in zip(low - origin, high - origin, strict=True):
+            if bottom > y and right > x:
+                mask[y:bottom, x:right] = 1.0
+        wanted, _ = patches._wanted(OPTIONS, box, jnp.asarray(mask))
+        assert patches.patches_along(OPTIONS, low, high) == int(wanted.sum())

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbrush import patches, poisson
+from jaxbrush import patches, poisson, seams
 
 OPTIONS = patches.PatchConfig(size=24, overlap=8)
 BOX = patches.Box(first=jnp.asarray([0, 0], jnp.int32), cells=(2, 2))
@@ -102,12 +102,12 @@ def test_unrelated_patches_blend_without_a_seam():
     side = 2 * OPTIONS.step
     mask = np.zeros((side, side), np.float32)
     mask[: -OPTIONS.overlap // 2, : -OPTIONS.overlap // 2] = 1.0  # all cores
-    measure = jax.jit(lambda *x: jnp.max(patches.seam(OPTIONS, *x, mask)))
+    measure = jax.jit(lambda *x: jnp.max(seams.seam(OPTIONS, *x, mask)))
     for offset in (0.0, 1.0):
         given = jnp.asarray(0.02 * noise, jnp.float32) + offset * shifted()
-        seams = {name: float(measure(given, FULL, x)) for name, x in blends(given, FULL).items()}
-        print(offset, seams)
-        assert seams["cut"] > 1.5 * max(seams["feather"], seams["poisson"])
+        found = {name: float(measure(given, FULL, x)) for name, x in blends(given, FULL).items()}
+        print(offset, found)
+        assert found["cut"] > 1.5 * max(found["feather"], found["poisson"])
     # Patches that agree have none, however rough.
     given = cut_all(picture(rough=3.0), FULL)
     for found in blends(given, FULL).values():
