@@ -136,7 +136,7 @@ def test_a_quarter_turn_changes_nothing():
     np.testing.assert_allclose(np.rot90(quarter), straight, atol=2e-4)
 
 
-COARSE = pytest.mark.xfail(reason="5.6 % less at 20 degrees, 9.2 % less at 45", strict=True)
+COARSE = pytest.mark.xfail(reason="4.8 % less at 20 degrees, 8.6 % less at 45", strict=True)
 
 
 @pytest.mark.parametrize("step", [0.06, pytest.param(0.12, marks=COARSE)])
@@ -152,9 +152,9 @@ def test_windows_at_the_sides_see_what_windows_inside_see():
     for cells in (12, 18):
         # The brush stays on the canvas, its window is stopped by the canvas's side.
         shifted = film(paint(x=2.0, y=MIDDLE - cells * CONFIG.pixel)[0])
-        np.testing.assert_allclose(shifted[: 56 - cells], inside[cells:], atol=2e-5)
+        np.testing.assert_allclose(shifted[: 56 - cells], inside[cells:], atol=5e-5)
         both = film(paint(x=2.0 - 0.5, y=MIDDLE - cells * CONFIG.pixel)[0])
-        np.testing.assert_allclose(both[: 56 - cells, :52], inside[cells:, 4:], atol=2e-5)
+        np.testing.assert_allclose(both[: 56 - cells, :52], inside[cells:, 4:], atol=5e-5)
 
 
 def test_paint_that_yields_creeps_farther_without_a_yield_stress():
@@ -215,15 +215,8 @@ def contrast(degrees):
     return np.std(profile.mean(1)) / profile.mean()
 
 
-LESS = pytest.mark.xfail(reason="2.4 % less paint is laid at 45 degrees", strict=True)
-SOFT = pytest.mark.xfail(
-    reason="grooves are softer on diagonals: contrast 0.190 at 20 degrees, 0.168 at 45, 0.237 at 0",
-    strict=True,
-)
-
-
 @pytest.mark.slow
-@pytest.mark.parametrize("degrees", [20, pytest.param(45, marks=LESS), 90])
+@pytest.mark.parametrize("degrees", [20, 45, 90])
 def test_the_real_brush_lays_as_much_in_every_direction(degrees):
     more = real(degrees).sum() / real(0).sum() - 1.0
     print(f"volume at {degrees} degrees: {100 * more:+.2f} %")
@@ -231,9 +224,7 @@ def test_the_real_brush_lays_as_much_in_every_direction(degrees):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    "degrees", [pytest.param(20, marks=SOFT), pytest.param(45, marks=SOFT), 90]
-)
+@pytest.mark.parametrize("degrees", [20, 45, 90])
 def test_grooves_are_as_deep_in_every_direction(degrees):
     there, straight = contrast(degrees), contrast(0)
     print(f"contrast at {degrees} degrees: {there:.3f}, straight {straight:.3f}")

@@ -5,6 +5,7 @@ Paint is flat planes (z, k, n), n = y * x.
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from jaxbrush.paint.state import PaintConfig, PaintParams
 from jaxbrush.paint.stencil import inner_x, inner_y, near, wide
@@ -14,14 +15,56 @@ SLOP = 1e-5
 """Excess or lack of a cell that is left alone, share of a cell."""
 
 
-def _slope(fill, width, shift):
-    """Van Leer slope of wide fill along one axis, (z, n)."""
-    here = near(fill, width)
-    forward = near(fill, width, shift) - here
-    backward = here - near(fill, width, -shift)
+def _slopes(fill, margin, shift, open_):
+    """Slopes of wide fill along one axis, (z, n): van Leer's, and what that lacks of fourth order.
+
+    open_: (1, n) 0 in the two cells next to a side of the window, where nothing lacks.
+    """
+    here = near(fill, margin)
+    forward = near(fill, margin, shift) - here
+    backward = here - near(fill, margin, -shift)
     smooth = forward * backward > 0.0
-    slope = jnp.where(smooth, 2.0 * forward * backward, 0.0)
-    return slope / jnp.where(smooth, forward + backward, 1.0)
+    limited = jnp.where(smooth, 2.0 * forward * backward, 0.0)
+    limited = limited / jnp.where(smooth, forward + backward, 1.0)
+    far = near(fill, margin, 2 * shift) - near(fill, margin, -2 * shift)
+    return limited, open_ * ((2.0 / 3.0) * (forward + backward) - far / 12.0 - limited)
+
+
+def _upwind(fill, width, face):
+    """Fill as it sets out for the faces along x and along y, and its slopes.
+
+    A limiter takes grooves for noise: they are 3 or 4 cells wide, and every cell is a crest or a
+    trough. Along the flow that does no harm to them. Across it, it smooths what no flow along an
+    axis would smooth: strokes at 45 degrees lost 29 % of their contrast. So slopes are limited
+    only along the flow. And paint that passes a face obliquely comes from half a stamp upstream in
+    the other direction too (corner transport), or it would be smoothed across the flow.
+
+    Args:
+      fill: wide with margins of two rows. face: wide displacements along x and y.
+
+    Returns:
+      (two wide fields to start from, two wide slopes) [share of a cell].
+    """
+    margin, shifts = 2 * width, (1, width)
+    here = near(fill, margin)
+    middle = [
+        0.5 * (near(f, width) + near(f, width, -s)) for f, s in zip(face, shifts, strict=True)
+    ]
+    open_ = np.pad(np.ones((width - 4, width - 4)), 2).reshape(1, -1)
+    pairs = [_slopes(fill, margin, shift, jnp.asarray(open_, here.dtype)) for shift in shifts]
+    limited, lack = zip(*pairs, strict=True)
+    # The part of what the limiter took away that points across the flow.
+    across = middle[1] * lack[0] - middle[0] * lack[1]
+    across = across / (middle[0] * middle[0] + middle[1] * middle[1] + 1e-9)
+    slopes = (limited[0] + middle[1] * across, limited[1] - middle[0] * across)
+    starts = []
+    for f, shift in ((face[1], width), (face[0], 1)):
+        change = jnp.clip(near(f, width), -1.0, 0.0) * (near(fill, margin, shift) - here)
+        change = change + jnp.clip(near(f, width, -shift), 0.0, 1.0) * (
+            here - near(fill, margin, -shift)
+        )
+        starts.append(wide(here - 0.5 * change, width))
+    return starts, [wide(s, width) for s in slopes]
 
 
 def advect(config: PaintConfig, paint, face):
@@ -31,17 +74,22 @@ def advect(config: PaintConfig, paint, face):
     no cell gives more than it has: amounts stay positive, colors in the hull of what was there.
     """
     width = config.window
-    fill = wide(jnp.sum(paint, axis=1), width)
-    here = near(fill, width)
+    # A row more in the margins than `near` elsewhere reads.
+    fill = wide(jnp.sum(paint, axis=1), 2 * width)
+    here = near(fill, 2 * width)
     steps = ((1, 0), (width, 0), (0, 1))
+    if config.limiter:
+        starts, slopes = _upwind(fill, width, face[:2])
     fluxes, out = [], 0.0
-    for (shift, layer), f in zip(steps, face, strict=True):
-        q = jnp.clip(near(f, width), -1.0, 1.0)
-        left, right = here, near(fill, width, shift, layer)
+    for k, (shift, layer) in enumerate(steps):
+        q = jnp.clip(near(face[k], width), -1.0, 1.0)
         if config.limiter and not layer:
-            slope = wide(_slope(fill, width, shift), width)
-            left = left + 0.5 * (1.0 - q) * near(slope, width)
-            right = right - 0.5 * (1.0 + q) * near(slope, width, shift)
+            left = near(starts[k], width) + 0.5 * (1.0 - q) * near(slopes[k], width)
+            right = near(starts[k], width, shift)
+            right = right - 0.5 * (1.0 + q) * near(slopes[k], width, shift)
+            left, right = jnp.maximum(left, 0.0), jnp.maximum(right, 0.0)
+        else:
+            left, right = here, near(fill, 2 * width, shift, layer)
         fluxes.append(wide(q * jnp.where(q > 0.0, left, right), width))
     for (shift, layer), flux in zip(steps, fluxes, strict=True):
         out = out + jnp.maximum(near(flux, width), 0.0)
