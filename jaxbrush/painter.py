@@ -178,6 +178,20 @@ def place(options: PainterConfig, shape, bounds) -> Box | Rect | None:
     return patches.box_of(options.patches, np.asarray(low), np.asarray(high), options.cells)
 
 
+PIECES = (96, 192)
+"""Sides of the rectangles that a preview is drawn in [pixels]: few, for few compilations."""
+
+
+def place_piece(options: PainterConfig, shape, bounds) -> Box | Rect | None:
+    """The rectangle that a few stamps draw in, None if they draw nothing; not jittable."""
+    there = reached(shape, bounds)
+    if there is None:
+        return None
+    low, high = ([getattr(s, end) for s in there] for end in ("start", "stop"))
+    rect = patches.rect_of(low, high, 0, shape, PIECES)
+    return place(options, shape, bounds) if rect is None else rect
+
+
 def plan(options: PainterConfig, canvas: Canvas, brush: BrushParams, stroke: Stroke):
     """Sizes and first patch for `paint_on`; not jittable.
 
@@ -269,7 +283,7 @@ def preview_stroke(
     return (_preview_over if donate else _preview)(options, box, drawn, canvas, color)
 
 
-def _covered(options, box, track):
+def _covered(options, box: Box | Rect, track):
     grid = patches.grid_of(options.patches, box, options.pixel)
     return trajectory_maps(grid, track).coverage > 0.0, patches.corner_of(options.patches, box)
 
@@ -277,7 +291,7 @@ def _covered(options, box, track):
 _covered_jit = jax.jit(_covered)
 
 
-def covered(options: PainterConfig, box: Box, track):
+def covered(options: PainterConfig, box: Box | Rect, track):
     """Where the bristles of a track draw: (h, w) bool on the pixels of a box, and (2,) the first
     pixel (y, x) of it on the canvas."""
     return _covered_jit(options, box, track)

@@ -323,7 +323,7 @@ class Session:
     def _preview(self, track, bounds) -> Patch | None:
         job = self._open
         shape = self._owner.shape
-        box = painter.place(self.options, shape, bounds)
+        box = painter.place_piece(self.options, shape, bounds)
         if box is None:
             return None
         cover, corner = painter.covered(self.options, box, track)
