@@ -44,6 +44,15 @@ def track(x=1.5, y=MIDDLE, low=0.02, length=3.6, step=0.12, angle=0.0, speed=60.
     return track_of(tip, lean, way / speed, np.arange(stamps) <= np.ceil(length / step - 1e-6))
 
 
+def pulled(low=0.02, y=3.0, travel=0.12, start=2.0, valid=24):
+    """The same bristles pulled along x from (start, y), 24 stamps `travel` apart [mm], of which
+    the first `valid` count."""
+    first = track(x=start, y=y, low=low, length=0.0)
+    tip = np.repeat(np.asarray(first.position[:1, -1], np.float64), 24, axis=0)
+    tip[:, 0] += travel * np.arange(24)[:, None]
+    return track_of(tip, valid=np.arange(24) < valid)
+
+
 def track_of(tip, lean=(0.6, 0.0, 0.8), time=None, valid=None):
     """A track of given tips (t, 3, b) [mm], the node above each a millimetre along `lean`."""
     stamps, _, bristles = tip.shape

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from paint_cases import BRISTLES, SIDE, brush_of, held, params_of, pulled
 
-from jaxbrush.brush import BristleTrack
 from jaxbrush.canvas import flatten
 from jaxbrush.paint import (
     PaintConfig,
@@ -24,40 +24,14 @@ from jaxbrush.paint.heightfield import (
 )
 
 CONFIG = heightfield_config(window=24, pigments=2)
-SHAPE, BRISTLES, STAMPS = (56, 56), 40, 24
-PARAMS = dict(tip_volume=1.2, reservoir_volume=9.0, contact_area=3.0)
+SHAPE = SIDE, SIDE
 stroke = jax.jit(heightfield_stroke)
 
 
-def track(low=0.02, y=3.0, travel=0.12, start=2.0, valid=STAMPS):
-    """Bristles on a 1 x 1.5 mm field pulled along x, tips at height `low` [mm]."""
-    rng = np.random.default_rng(0)
-    root = rng.uniform(-0.5, 0.5, (2, BRISTLES)) * np.array([[1.0], [1.5]])
-    x = start + travel * np.arange(STAMPS)
-    tip = np.empty((STAMPS, 3, BRISTLES))
-    tip[:, 0] = x[:, None] + root[0]
-    tip[:, 1] = y + root[1]
-    tip[:, 2] = low + 0.05 * rng.uniform(size=BRISTLES)
-    up = tip + np.array([0.6, 0.0, 0.8])[None, :, None]
-    position = np.stack([up, tip], axis=1)
-    return BristleTrack(
-        time=jnp.asarray(0.002 * np.arange(STAMPS), jnp.float32),
-        position=jnp.asarray(position, jnp.float32),
-        force=jnp.ones((STAMPS, 2, BRISTLES), jnp.float32),
-        reaction=jnp.zeros((STAMPS, 3), jnp.float32),
-        valid=jnp.arange(STAMPS) < valid,
-    )
-
-
 def paint(load=0.8, mix=(1.0, 0.0), canvas=None, **where):
-    params = make_params(**PARAMS)
     canvas = empty_canvas(CONFIG, SHAPE) if canvas is None else canvas
-    brush = load_brush(CONFIG, params, BRISTLES, load, jnp.asarray(mix))
-    return brush, *stroke(CONFIG, params, canvas, brush, track(**where))
-
-
-def held(brush):
-    return np.asarray(brush.tip, np.float64).sum(1) + np.asarray(brush.reservoir, np.float64).sum(1)
+    brush = brush_of(load, mix)
+    return brush, *stroke(CONFIG, params_of(), canvas, brush, pulled(**where))
 
 
 def laid(canvas):
@@ -167,10 +141,7 @@ def test_hard_cases_stay_finite_and_conserve(case):
 
 
 def test_padding_and_edges():
-    params = make_params(**PARAMS)
-    brush = load_brush(CONFIG, params, BRISTLES, 0.8, jnp.asarray([1.0, 0.0]))
-    moves = track(y=0.3, start=0.2, valid=10)
-    canvas, wet, _ = stroke(CONFIG, params, empty_canvas(CONFIG, SHAPE), brush, moves)
+    brush, canvas, wet, _ = paint(y=0.3, start=0.2, valid=10)
     assert laid(canvas).sum() + held(wet).sum() == pytest.approx(held(brush).sum(), rel=1e-6)
     assert np.all(np.asarray(canvas)[..., 30:] == 0.0)
     assert np.all(np.isfinite(np.asarray(canvas)))
@@ -178,10 +149,9 @@ def test_padding_and_edges():
 
 def test_film_thickness_is_that_of_the_3d_simulator():
     grid = PaintConfig(layers=12, window=24, pigments=2, samples=3, sweeps=1)
-    params = make_params(**PARAMS)
-    mix = jnp.asarray([1.0, 0.0])
-    full = load_brush(grid, params, BRISTLES, 0.8, mix)
-    solid, left, _ = jax.jit(paint_stroke)(grid, params, empty_canvas(grid, SHAPE), full, track())
+    params = params_of()
+    full = brush_of()
+    solid, left, _ = jax.jit(paint_stroke)(grid, params, empty_canvas(grid, SHAPE), full, pulled())
     _, canvas, brush, _ = paint()
     middle = np.s_[20:28, 22:34]
     truth = np.median(np.asarray(height(grid, solid))[middle])
@@ -235,19 +205,19 @@ def test_what_does_not_fit_is_refused():
     params = make_params()
     brush = load_brush(CONFIG, params, BRISTLES, 1.0, jnp.asarray([1.0, 0.0]))
     with pytest.raises(ValueError, match="canvas has shape"):
-        heightfield_stroke(CONFIG, params, jnp.zeros((3, 2, 56, 56)), brush, track())
+        heightfield_stroke(CONFIG, params, jnp.zeros((3, 2, 56, 56)), brush, pulled())
     with pytest.raises(ValueError, match="brush.tip"):
         few = load_brush(CONFIG, params, 3, 1.0, jnp.asarray([1.0, 0.0]))
-        heightfield_stroke(CONFIG, params, empty_canvas(CONFIG, SHAPE), few, track())
+        heightfield_stroke(CONFIG, params, empty_canvas(CONFIG, SHAPE), few, pulled())
     with pytest.raises(ValueError, match="films"):
         grid = PaintConfig(window=24, pigments=2)
-        heightfield_stroke(grid, params, empty_canvas(grid, SHAPE), brush, track())
+        heightfield_stroke(grid, params, empty_canvas(grid, SHAPE), brush, pulled())
 
 
 def test_batched_equals_alone():
-    params = make_params(**PARAMS)
-    brush = load_brush(CONFIG, params, BRISTLES, 0.8, jnp.asarray([1.0, 0.0]))
+    params, brush = params_of(), brush_of()
     canvases = jnp.stack([slab(0.0), slab(0.1)])
-    many = jax.jit(jax.vmap(lambda c: heightfield_stroke(CONFIG, params, c, brush, track())[0]))
-    alone = [stroke(CONFIG, params, c, brush, track())[0] for c in canvases]
+    moves = pulled()
+    many = jax.jit(jax.vmap(lambda c: heightfield_stroke(CONFIG, params, c, brush, moves)[0]))
+    alone = [stroke(CONFIG, params, c, brush, moves)[0] for c in canvases]
     np.testing.assert_allclose(np.asarray(many(canvases)), np.stack(alone), atol=2e-5)

@@ -1,11 +1,10 @@
 """Whole strokes of paint, small: conservation, what is not touched, what was never loaded."""
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from paint_cases import BRISTLES, SIDE, brush_of, held, params_of, pulled, stroke
 
-from jaxbrush.brush import BristleTrack
 from jaxbrush.paint import (
     PaintConfig,
     empty_canvas,
@@ -17,39 +16,12 @@ from jaxbrush.paint import (
 )
 
 CONFIG = PaintConfig(layers=8, window=24, pigments=2, samples=2, sweeps=1, viscous=3, pressure=4)
-BRISTLES, STAMPS = 40, 24
-stroke = jax.jit(paint_stroke)
-
-
-def track(low=0.02, y=3.0, travel=0.12, stamps=STAMPS, start=2.0):
-    """Bristles on a 1 x 1.5 mm field pulled along x, tips at height `low` [mm]."""
-    rng = np.random.default_rng(0)
-    root = rng.uniform(-0.5, 0.5, (2, BRISTLES)) * np.array([[1.0], [1.5]])
-    x = start + travel * np.arange(stamps)
-    tip = np.empty((stamps, 3, BRISTLES))
-    tip[:, 0] = x[:, None] + root[0]
-    tip[:, 1] = y + root[1]
-    tip[:, 2] = low + 0.05 * rng.uniform(size=BRISTLES)
-    up = tip + np.array([0.6, 0.0, 0.8])[None, :, None]
-    position = np.stack([up, tip], axis=1)
-    return BristleTrack(
-        time=jnp.asarray(0.002 * np.arange(stamps), jnp.float32),
-        position=jnp.asarray(position, jnp.float32),
-        force=jnp.ones((stamps, 2, BRISTLES), jnp.float32),
-        reaction=jnp.zeros((stamps, 3), jnp.float32),
-        valid=jnp.ones(stamps, bool),
-    )
 
 
 def paint(load=0.8, mix=(1.0, 0.0), canvas=None, **where):
-    params = make_params(tip_volume=1.2, reservoir_volume=9.0, contact_area=3.0)
-    canvas = empty_canvas(CONFIG, (56, 56)) if canvas is None else canvas
-    brush = load_brush(CONFIG, params, BRISTLES, load, jnp.asarray(mix))
-    return brush, *stroke(CONFIG, params, canvas, brush, track(**where))
-
-
-def held(brush):
-    return np.asarray(brush.tip, np.float64).sum(1) + np.asarray(brush.reservoir, np.float64).sum(1)
+    canvas = empty_canvas(CONFIG, (SIDE, SIDE)) if canvas is None else canvas
+    brush = brush_of(load, mix)
+    return brush, *stroke(CONFIG, params_of(), canvas, brush, pulled(**where))
 
 
 def test_a_stroke_conserves_every_pigment():
@@ -76,7 +48,7 @@ def test_white_stays_white_and_what_is_far_is_not_touched():
 
 
 def test_dirty_canvas_smears_only_downstream():
-    band = empty_canvas(CONFIG, (56, 56)).at[:3, 1, :, 28:34].set(1.0)
+    band = empty_canvas(CONFIG, (SIDE, SIDE)).at[:3, 1, :, 28:34].set(1.0)
     before, canvas, brush, _ = paint(load=0.3, canvas=band)
     total = np.asarray(volume(CONFIG, band), np.float64) + held(before)
     now = np.asarray(volume(CONFIG, canvas), np.float64) + held(brush)
@@ -104,13 +76,8 @@ def test_a_brush_in_the_air_leaves_the_canvas_alone():
 
 
 def test_padding_and_edges():
-    params = make_params(tip_volume=1.2, reservoir_volume=9.0, contact_area=3.0)
-    brush = load_brush(CONFIG, params, BRISTLES, 0.8, jnp.asarray([1.0, 0.0]))
     # Half the brush over the edge, the rest of the stroke padding.
-    moves = track(y=0.3, start=0.2)
-    valid = jnp.arange(STAMPS) < 10
-    moves = BristleTrack(moves.time, moves.position, moves.force, moves.reaction, valid)
-    canvas, wet, _ = stroke(CONFIG, params, empty_canvas(CONFIG, (56, 56)), brush, moves)
+    brush, canvas, wet, _ = paint(y=0.3, start=0.2, valid=10)
     total = float(volume(CONFIG, canvas).sum()) + held(wet).sum()
     assert total == pytest.approx(held(brush).sum(), rel=1e-6)
     assert np.all(np.asarray(canvas)[..., 30:] == 0.0)
@@ -121,10 +88,10 @@ def test_shapes_that_do_not_fit_are_refused():
     params = make_params()
     brush = load_brush(CONFIG, params, BRISTLES, 1.0, jnp.asarray([1.0, 0.0]))
     with pytest.raises(ValueError, match="canvas has shape"):
-        paint_stroke(CONFIG, params, jnp.zeros((4, 2, 56, 56)), brush, track())
+        paint_stroke(CONFIG, params, jnp.zeros((4, 2, SIDE, SIDE)), brush, pulled())
     with pytest.raises(ValueError, match="brush.tip"):
         few = load_brush(CONFIG, params, 3, 1.0, jnp.asarray([1.0, 0.0]))
-        paint_stroke(CONFIG, params, empty_canvas(CONFIG, (56, 56)), few, track())
+        paint_stroke(CONFIG, params, empty_canvas(CONFIG, (SIDE, SIDE)), few, pulled())
     with pytest.raises(ValueError, match="window"):
         empty_canvas(CONFIG, (8, 56))
     with pytest.raises(ValueError, match="solver"):
