@@ -68,10 +68,10 @@ def maps_of(stroke, shape=(64, 64), options=OPTIONS):
 
 
 def mask_of(stroke, shape=(64, 64)):
-    """The mask on the canvas."""
+    """Where the stroke is laid on the canvas."""
     box, drawn, *_ = maps_of(stroke, shape)
     y, x = np.asarray(patches.corner_of(OPTIONS.patches, box))
-    full, mask = np.zeros(shape), np.asarray(drawn.mask[..., 0])
+    full, mask = np.zeros(shape), np.asarray(drawn.share[..., 0])
     rows = slice(max(y, 0), min(y + mask.shape[0], shape[0]))
     columns = slice(max(x, 0), min(x + mask.shape[1], shape[1]))
     full[rows, columns] = mask[rows.start - y : rows.stop - y, columns.start - x : columns.stop - x]
@@ -201,7 +201,8 @@ def test_networks_see_what_they_were_trained_on():
             Generator(net.config).apply(net.variables, x)
         )
         height = run(network(2, 1), data.height_batch(pair).inputs)
-        new = jnp.where(pair["mask"] > 0.0, data.LEVELS["height"] * height, pair["height"])
+        new = data.LEVELS["height"] * height - pair["height"]
+        new = pair["height"] + pair["share"] * new
         color = run(network(8, 3), data.color_batch(pair | {"new_height": new}).inputs)
         return jnp.concatenate([height, color], axis=-1)
 
@@ -317,7 +318,7 @@ def test_moments_of_the_whole_stroke_leave_no_seam():
     shade = jnp.linspace(0.1, 2.0, side)[:, None, None] * jnp.asarray(mask)
     drawn = stages.Drawn(
         pressure=draw(1) * shade, time=draw(1) * shade, trajectory=draw(3) * jnp.asarray(mask),
-        mask=jnp.asarray(mask), whole=jnp.asarray(True),
+        mask=jnp.asarray(mask), share=jnp.asarray(mask), whole=jnp.asarray(True),
     )  # fmt: skip
 
     @functools.partial(jax.jit, static_argnames="moments")
