@@ -57,7 +57,7 @@ class PainterConfig:
     edge: float | None = None
     stamps: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
     cells: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
-    sides: tuple[int, ...] = (64, 96, 128, 192, 256, 384, 512)
+    sides: tuple[int, ...] = (96, 256, 512)
     batch: int = 1
 
     def __post_init__(self):
@@ -231,8 +231,8 @@ def cut(
       layout: of the box; a Rect is its own.
 
     Returns:
-      dict of height [mm], pressure, time, mask, share (n, size, size, 1), color, trajectory (n, size,
-      size, 3) in sRGB; of a Rect one, of its sides.
+      dict of height [mm], pressure, time, mask, share (n, size, size, 1), color, trajectory (n,
+      size, size, 3) in sRGB; of a Rect one, of its sides.
     """
     names = ("pressure", "time", "mask", "share", "trajectory")
     field = jnp.concatenate([getattr(drawn, name) for name in names], axis=-1)
