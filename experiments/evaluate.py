@@ -88,9 +88,8 @@ def main(options: Config) -> None:
         pairs = train_network.pairs_of(found, options.split, index, kind, seen)
         rows = evaluation.compare(kind, predicted(exported, pairs), pairs, scale)
         if kind == "color" and chained and seen.height:
-            shape = train_network.Config(**chained.card.get("inputs", {}))
-            heights = train_network.pairs_of(found, options.split, index, "height", shape)
-            used = with_height(pairs, predicted(chained, heights))
+            laid = train_network.predicted_heights(found, options.split, index, chained)
+            used = with_height(pairs, data.network_height(laid))
             picture = predicted(exported, used)
             rows = {
                 "on predicted height": evaluation.errors(kind, picture, used.batch, scale)

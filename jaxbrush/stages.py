@@ -186,6 +186,16 @@ def last_touch(options: PainterConfig, corner, bounds):
     return jnp.max(jnp.where(jnp.all(hit, axis=-1), stamp, -1), axis=1)
 
 
+def faded(cover):
+    """Coverage (h, w) to the share of what is painted: 1 a pixel beyond it, 0 after `RIM`; and
+    coverage dilated by `RIM`."""
+    share = jnp.zeros_like(cover)
+    for _ in range(RIM):
+        cover = dilate(cover, 1)
+        share = share + cover / RIM
+    return share, cover
+
+
 def draw(
     options: PainterConfig, box: Box | Rect, shape, track: BristleTrack, color, duration=None
 ) -> Drawn:
@@ -207,11 +217,7 @@ def draw(
     inside = inside.astype(maps.coverage.dtype)[..., None]
     # Kept as an array: worked out again at every shift of the dilation it is slow.
     cover = jax.lax.optimization_barrier(maps.coverage)
-    grown = cover
-    share = jnp.zeros_like(cover)
-    for _ in range(RIM):
-        grown = dilate(grown, 1)
-        share = share + grown / RIM
+    share, grown = faded(cover)
     return Drawn(
         pressure=maps.pressure[..., None],
         time=time[..., None],

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate
+from experiments import evaluate, train_network
 from jaxbrush import checkpoint, data, pairs
 from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
@@ -209,3 +209,22 @@ def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
     alone = pairs.canvas_pairs(SMALL, SEED, OPTIONS.train)[0]  # the next training canvas
     stored = found.take("test", [0])
     assert np.abs(stored["new_height"][0, ..., 0] - alone.new_height).max() > 0.02
+
+
+def test_every_second_color_pair_is_given_the_predicted_height(folder):
+    found = data.load(folder)
+    config = GeneratorConfig(outputs=1, width=0.05)
+    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 2)))
+    network = checkpoint.Exported(variables, config, {})
+    index = np.arange(found.count("train"))
+    heights = train_network.predicted_heights(found, "train", index, network)
+    raw = found.take("train", index)
+    cover = np.asarray(data.touched(raw))
+    # Where bristles came it is the network's, far from them the canvas as it was.
+    assert np.abs(heights - raw["new_height"])[cover].max() > 0.1
+    np.testing.assert_array_equal(heights[raw["mask"] == 0.0], raw["height"][raw["mask"] == 0.0])
+    stored = train_network.Stored(found, index, "color", train_network.Config(), heights)
+    given = stored.take(index).inputs[..., -1]
+    np.testing.assert_allclose(given[1::2], data.network_height(heights)[1::2, ..., 0], atol=1e-6)
+    true = data.network_height(raw["new_height"])[..., 0]
+    np.testing.assert_allclose(given[::2], true[::2], atol=1e-6)
