@@ -11,7 +11,7 @@ import numpy as np
 from experiments import evaluation, make_dataset, training
 from experiments.common import console
 from experiments.evaluation import Pairs, Scale
-from jaxbrush import checkpoint, data, stages
+from jaxbrush import data, stages
 
 HELD = 2
 """Canvases of the training split, at most, that choose the best checkpoint and are not learned
@@ -32,21 +32,16 @@ class Config(training.Options):
     """Color: with the time map (paper Figure 4)."""
     height: bool = True
     """Color: with the new height (paper Figure 5)."""
-    height_network: Path | None = None
-    """Color: an exported height network; every second pair is given the height that it predicts in
-    place of the true one, as in use."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stored:
-    """Pairs that stay on disk until they are taken; what `training.run` learns from. heights: of
-    all of them from `predicted_heights`, which every second pair is given, or None."""
+    """Pairs that stay on disk until they are taken; what `training.run` learns from."""
 
     found: data.Dataset
     index: np.ndarray
     kind: str
     options: Config
-    heights: np.ndarray | None = None
 
     def __len__(self):
         return len(self.index)
@@ -58,9 +53,6 @@ class Stored:
 
     def take(self, index):
         raw = self.found.take("train", self.index[index])
-        if self.heights is not None:
-            odd = (np.asarray(index) % 2 == 1)[:, None, None, None]
-            raw["new_height"] = np.where(odd, self.heights[index], raw["new_height"])
         return jax.device_get(batch_of(raw, self.kind, self.options))
 
 
@@ -96,21 +88,14 @@ def predicted_heights(found: data.Dataset, split: str, index, exported) -> np.nd
 
 def main(kind: str, options: Config) -> None:
     try:
-        network = None
-        if kind == "color" and options.height_network:
-            network = checkpoint.load(options.height_network)
         folder = make_dataset.build(options.preset, options.data)
         found = data.load(folder)
-    except (ValueError, OSError) as error:
+    except data.DataError as error:
         raise SystemExit(f"{error}") from error
     strokes = found.options.pairs.strokes
     held = strokes * min(HELD, max(1, found.options.train // 10))
     numbers = np.arange(found.count("train"))
     take = lambda split, index: pairs_of(found, split, index, kind, options)  # noqa: E731
-    heights = None
-    if network is not None:
-        with console.status("heights as the network predicts them"):
-            heights = predicted_heights(found, "train", numbers[:-held], network)
     size, tests = found.options.pairs.size, found.count("test")
     about = (
         f"{options.preset}, seed {found.seed}: {len(numbers)} + {tests} pairs of {size} x {size}"
@@ -120,7 +105,7 @@ def main(kind: str, options: Config) -> None:
         training.fit(
             options,
             kind,
-            Stored(found, numbers[:-held], kind, options, heights),
+            Stored(found, numbers[:-held], kind, options),
             take("train", numbers[-held:]),
             take("test", np.arange(tests)),
             scale,

@@ -143,6 +143,15 @@ def test_one_piece_where_it_is_less_work():
     assert isinstance(place(straight, (400, 400), few), patches.Box)
 
 
+def test_a_stroke_fades_out_within_its_rim():
+    cover = np.zeros((24, 24), np.float32)
+    cover[10:13, 9:12] = 1.0
+    share, grown = stages.faded(jnp.asarray(cover))
+    np.testing.assert_allclose(share[11, 11:18], [1.0, 1.0, 0.75, 0.5, 0.25, 0.0, 0.0], atol=1e-6)
+    assert float(share.max()) <= 1.0 and stages.RIM == 4
+    np.testing.assert_array_equal(np.asarray(grown) > 0.0, np.asarray(share) > 0.0)
+
+
 def test_the_stroke_counts_no_more_than_in_training():
     rng = np.random.default_rng(0)
     for share in (0.0, 0.1, 0.6, 1.0):

@@ -70,6 +70,18 @@ def test_streamed_and_resident_pairs_give_the_same_batches():
         np.testing.assert_array_equal(a.target, pairs.batch.target[i])
 
 
+def test_color_pairs_are_recolored_by_the_number_of_the_step():
+    pairs = toy(5, side=8, kind="color")
+    options = dataclasses.replace(SMALL, turns=False)
+    plain = training.make_batches(pairs, options)(3)[0]
+    make = training.make_batches(pairs, options, recolor=True)
+    first, again, other = make(3)[0], make(3)[0], make(8)[0]
+    np.testing.assert_array_equal(first.target, again.target)
+    assert np.abs(first.target - plain.target).max() > 0.01
+    assert np.abs(first.target - other.target).max() > 0.01
+    np.testing.assert_array_equal(first.inputs[..., 6:], plain.inputs[..., 6:])
+
+
 def test_pairs_are_turned_in_eight_ways_all_maps_alike():
     pairs = toy(2, side=8)
     seen = set()
