@@ -182,20 +182,18 @@ def parts(case: dict, params) -> dict:
     grid, track, radius = case["grid"], case["track"], 0.5 * WIDTH / PIXEL
     stamps = track.time.shape[0]
     first = jax.jit(lambda g, t: (sweep(g, t), exact.table_of(sweep(g, t), radius)))
-    latest = jax.jit(lambda t: exact.latest(t, stamps, grid.shape, radius))
-    passes = jax.jit(lambda t: exact.passes(t, stamps, grid.shape, radius))
+    both = jax.jit(lambda t: exact.images(t, stamps, grid.shape, radius))
+    latest = jax.jit(lambda t: exact.images(t, stamps, grid.shape, radius)[0])
     values = jax.jit(lambda s, t, k: exact.values(s, t, k, radius))
-    without = jax.jit(lambda g, t: dataclasses.replace(trajectory_maps(g, t), sweeps=None))
     sweeps, table = first(grid, track)
     key = latest(table)
     return {
         "bristles (rollout)": lambda: roll(BrushConfig(), params, case["stroke"]),
         "sweeps and their table": lambda: first(grid, track),
         "keys of the latest sweep": lambda: latest(table),
-        "passes (sweep count)": lambda: passes(table),
+        "keys and passes (sweep count)": lambda: both(table),
         "look-up of values": lambda: values(sweeps, table, key),
         "all maps": lambda: draw(grid, track),
-        "all maps but the sweep count": lambda: without(grid, track),
         "bristles and maps in one": lambda: paint(BrushConfig(), params, case["stroke"], grid),
     }
 

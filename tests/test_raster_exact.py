@@ -103,8 +103,7 @@ def test_scatter_and_loop_agree():
     def by_scatter(track):
         sweeps = sweeps_of(grid, track, 1, 0.0)
         table, stamps = exact.table_of(sweeps, RADIUS), track.time.shape[0]
-        key = exact.latest(table, stamps, grid.shape, RADIUS, "gpu")
-        passes = exact.passes(table, stamps, grid.shape, RADIUS, "gpu")
+        key, passes = exact.images(table, stamps, grid.shape, RADIUS, "gpu")
         return *exact.values(sweeps, table, key, RADIUS), passes, key
 
     track = padded(random_track(1))

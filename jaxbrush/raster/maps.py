@@ -94,14 +94,14 @@ def trajectory_maps(
     sweeps = sweeps_of(grid, track, nodes, 0.0)
     table = exact.table_of(sweeps, radius)
     still = jax.lax.stop_gradient(table)
-    key = exact.latest(still, stamps, grid.shape, radius)
+    key, passes = exact.images(still, stamps, grid.shape, radius)
     force, time = exact.values(sweeps, table, key, radius)
     covered = key > 0
     _, bristle = exact.decode(key, b * nodes)
     dtype = force.dtype
     return TrajectoryMaps(
         pressure=force / FORCE_UNIT,
-        sweeps=exact.passes(still, stamps, grid.shape, radius).astype(dtype),
+        sweeps=passes.astype(dtype),
         color=jnp.where(covered[..., None], color[bristle], 0.0),
         time=time,
         coverage=covered.astype(dtype),
