@@ -223,14 +223,17 @@ def main(options: Config) -> None:
             paint_session.save(folder / f"white_{name.split(', ')[-1]}.png",
                                paint_session.lit(canvases[len(deeds)]))  # fmt: skip
     chart(options, last, results, tints, folder / "engines.png")
-    took = 1e3 * engines.preview_times(
+    waits = engines.preview_times(
         painter.PainterConfig(), painter.load_nets(*options.weights), shape, session_deeds
     )
-    quantiles = dict(zip(("median", "p95", "p99", "worst"), np.percentile(took, (50, 95, 99, 100)),
-                         strict=True))  # fmt: skip
+    named = ("median", "p95", "p99", "worst")
+    quantiles, finished = (
+        dict(zip(named, np.percentile(1e3 * w, (50, 95, 99, 100)), strict=True)) for w in waits
+    )
     write_run(
         folder, options,
-        {"engines": results, "white_over_white": tints, "preview_ms": quantiles},
+        {"engines": results, "white_over_white": tints, "preview_ms": quantiles,
+         "finished_ms": finished},
     )  # fmt: skip
     rows = []
     for name, row in results.items():
@@ -248,8 +251,14 @@ def main(options: Config) -> None:
         rows = [[stage, *row] for stage, row in results[name]["stages"].items()]
         print_table(f"{name}: ms a stroke", ["stage", "median", "95 %", "worst", "first"], rows)
 
-    text = ", ".join(f"{name} {value:.1f}" for name, value in quantiles.items())
-    console.print(f"Preview after the last sample of a frame, networks at work, ms: {text}.")
+    print_table(
+        "A session at the speed of a hand, the networks at work between strokes: ms",
+        ["after", *named],
+        [
+            [what, *(f"{x:.1f}" for x in times.values())]
+            for what, times in (("its last sample", quantiles), ("pen-up, the paint", finished))
+        ],
+    )  # fmt: skip
 
 
 if __name__ == "__main__":

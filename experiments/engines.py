@@ -237,14 +237,26 @@ class Neural:
 
 FRAME = 1.0 / 60.0
 """Of a screen [s]."""
+PAUSE = 0.2
+"""Between strokes [s]: the median of the recorded painting that ships with libmypaint is 0.22 s."""
 
 
-def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, deeds) -> np.ndarray:
-    """Seconds from the last sample of each frame of 1/60 s to its preview, the networks at work on
-    the strokes before; every deed drawn twice, the first time to compile."""
-    took = []
+def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, deeds):
+    """Draws a session as a hand would, the networks at work, twice: the first time compiles.
+
+    Returns:
+      Seconds from the last sample of each frame of 1/60 s to its preview, and from each pen-up to
+      the finished stroke, noticed at the next frame.
+    """
+    took, ended, late = [], {}, {}
+
+    def poll(session):
+        for patch in session.poll():
+            late.setdefault(patch.stroke, time.perf_counter() - ended[patch.stroke])
+
     with Live(options, nets, blank(shape)) as session:
         for warm in (False, True):
+            took.clear(), late.clear()
             for deed in deeds:
                 session.begin(deed.brush, deed.color)
                 pen = jax.tree.map(np.asarray, deed.stroke)
@@ -256,15 +268,18 @@ def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, dee
                         pen.time[at], *pen.position[at].T, pen.pressure[at], pen.altitude[at],
                         pen.azimuth[at], pen.twist[at],
                     )  # fmt: skip
-                    spent = time.perf_counter() - start
+                    took.append(time.perf_counter() - start)
+                    poll(session)
                     if warm:
-                        took.append(spent)
-                        # As a hand would: the next samples are not there yet.
-                        time.sleep(max(0.0, FRAME - spent))
-                session.end()
-                session.poll()
+                        # The next samples are not there yet.
+                        time.sleep(max(0.0, start + FRAME - time.perf_counter()))
+                ended[session.end()] = up = time.perf_counter()
+                while warm and time.perf_counter() < up + PAUSE:
+                    time.sleep(FRAME)
+                    poll(session)
             session.wait()
-    return np.asarray(took)
+            poll(session)
+    return np.asarray(took), np.asarray(list(late.values()))
 
 
 SHIPPED = (Path("checkpoints/height.npz"), Path("checkpoints/color.npz"))

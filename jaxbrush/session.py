@@ -14,20 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush import painter
-from jaxbrush.brush import BrushParams, advance, begin
+from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
 from jaxbrush.data import PREVIEW_FILM
 from jaxbrush.painter import Nets, PainterConfig
-from jaxbrush.pairs import coated
+from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.recordings import BrushEvent, ColorEvent, StrokeEvent
 from jaxbrush.recordings import Session as Recording
-from jaxbrush.stages import touches
-from jaxbrush.stylus import Stroke, make_stroke
-
-PIECE = 32
-"""Stamps that the preview moves the brush at once; a multiple of every stride in use."""
-FIELDS = ("time", "x", "y", "pressure", "altitude", "azimuth", "twist")
-_UPRIGHT = {"altitude": 0.5 * np.pi, "azimuth": 0.0, "twist": 0.0}
+from jaxbrush.stylus import Stroke
 
 
 @dataclasses.dataclass(frozen=True)
@@ -59,92 +53,11 @@ class _Job:
     error: Exception | None = None
 
 
-def _piece(options: PainterConfig, brush, motion, stroke):
-    track, motion = advance(options.brush, brush, motion, stroke)
-    track = coated(track)
-    return track, touches(options, track), motion
-
-
-_advance = jax.jit(_piece)
-_begin = jax.jit(begin, static_argnums=0)
-
-
-class _Pen:
-    """The stroke under the pen: its samples, and how far the preview has moved the brush."""
-
-    def __init__(self, options: PainterConfig, brush: BrushParams):
-        self.options, self.brush = options, brush
-        self.depth = float(brush.press_depth)
-        self.samples = {name: np.zeros(0) for name in FIELDS}
-        self.way = np.zeros(0)
-        self.motion, self.done = None, 0
-
-    def add(self, new: dict):
-        """Takes samples, and measures the way to each in stamps, as `stylus.resample` does."""
-        joined = {n: np.concatenate([self.samples[n], new[n]]) for n in FIELDS}
-        for name in ("azimuth", "twist"):
-            joined[name] = np.unwrap(joined[name])
-        d = [np.diff(joined[n]) for n in ("x", "y", "pressure")]
-        steps = np.sqrt(d[0] ** 2 + d[1] ** 2 + (self.depth * d[2]) ** 2) / self.options.pixel
-        self.samples, self.way = joined, np.concatenate([[0.0], np.cumsum(steps)])
-
-    def _stamps(self, first: int) -> Stroke:
-        """PIECE + 1 stamps from number `first` on; those past the pen repeat its place."""
-        number = first + np.arange(PIECE + 1)
-        at = np.minimum(number, self.way[-1])
-        now = {n: np.interp(at, self.way, self.samples[n]).astype(np.float32) for n in FIELDS}
-        return Stroke(
-            time=now["time"] - np.float32(self.samples["time"][0]),
-            position=np.stack([now["x"], now["y"]], 1),
-            pressure=now["pressure"],
-            altitude=now["altitude"],
-            azimuth=now["azimuth"],
-            twist=now["twist"],
-            valid=number < np.ceil(self.way[-1]) + 1,
-        )
-
-    def advance(self):
-        """(track, touches) of each piece that is new or has grown."""
-        config = self.options.brush
-        if self.motion is None:
-            self.motion = _begin(config, self.brush, self._stamps(0))
-        while True:
-            piece = self._stamps(self.done)
-            track, bounds, motion = _advance(self.options, self.brush, self.motion, piece)
-            yield track, bounds
-            # Only once the pen is past it, a piece is what it will stay.
-            if self.way[-1] < self.done + PIECE:
-                return
-            self.motion, self.done = motion, self.done + PIECE
-
-    def stroke(self) -> Stroke:
-        s = self.samples
-        return make_stroke(
-            np.stack([s["x"], s["y"]], 1).astype(np.float32),
-            (s["time"] - s["time"][0]).astype(np.float32),
-            *(s[n].astype(np.float32) for n in FIELDS[3:]),
-        )
-
-
-def _checked(pen: _Pen, given: dict) -> dict:
-    count = np.size(given["x"])
-    out = {}
-    for name in FIELDS:
-        value = _UPRIGHT[name] if given[name] is None else given[name]
-        value = np.asarray(value, float)
-        if value.size not in (1, count) or value.ndim > 1 or not np.all(np.isfinite(value)):
-            raise ValueError(f"{name} = {given[name]!r}: expected {count} finite numbers")
-        out[name] = np.broadcast_to(value, (count,))
-    if count and not (0.0 <= out["pressure"].min() and out["pressure"].max() <= 1.0):
-        raise ValueError(f"pressure = {given['pressure']!r}: expected numbers within [0, 1]")
-    times = np.concatenate([pen.samples["time"][-1:], out["time"]])
-    if np.any(np.diff(times) < 0.0):
-        raise ValueError(f"time = {given['time']!r}: expected no step back")
-    return out
-
-
 class Session:
     """Paints while the pen moves.
+
+    The pen goes first: while it is down the networks rest, between the stages of a stroke, so that
+    previews find the processor free. They go on when it is lifted, or in `wait` and `close`.
 
     Call from one thread. `begin`, `add`, `end` draw a stroke; each returns in a frame. `poll` gives
     what the networks have finished since. `with Session(...) as session` closes it at the end.
@@ -167,6 +80,8 @@ class Session:
         self._lock = threading.Lock()
         self._idle = threading.Condition(self._lock)
         self._queue = queue.SimpleQueue()
+        self._lifted = threading.Event()
+        self._lifted.set()
         self._waiting: list[_Job] = []
         self._history = collections.deque(maxlen=undo)
         self._news: list[Patch] = []
@@ -208,7 +123,8 @@ class Session:
         self._count += 1
         color = tuple(float(c) for c in color)
         self._open = _Job(self._count, brush, color, event or {})
-        self._pen = _Pen(self.options, brush)
+        self._pen = Pen(self.options, brush)
+        self._lifted.clear()
         return self._count
 
     def add(self, time, x, y, pressure, altitude=None, azimuth=None, twist=None) -> list[Patch]:
@@ -226,7 +142,7 @@ class Session:
         """
         if not self._open:
             raise RuntimeError("no stroke is open: call begin")
-        new = _checked(self._pen, dict(zip(
+        new = checked(self._pen, dict(zip(
             FIELDS, (time, x, y, pressure, altitude, azimuth, twist), strict=True
         )))  # fmt: skip
         if not new["x"].size:
@@ -243,7 +159,8 @@ class Session:
         """
         if not self._open:
             raise RuntimeError("no stroke is open: call begin")
-        job, pen, self._open, self._pen = self._open, self._pen, None, None
+        job, pen = self._open, self._pen
+        self._lift()
         if pen.samples["x"].size:
             job.stroke, job.samples = pen.stroke(), pen.samples
             with self._lock:
@@ -261,9 +178,13 @@ class Session:
         return news
 
     def wait(self, timeout: float | None = None) -> bool:
-        """Waits until every stroke is finished; False after `timeout` seconds."""
+        """Waits until every stroke that was ended is finished; False after `timeout` seconds."""
+        self._lifted.set()
         with self._idle:
-            return self._idle.wait_for(lambda: not self._waiting, timeout)
+            done = self._idle.wait_for(lambda: not self._waiting, timeout)
+        if self._open:
+            self._lifted.clear()
+        return done
 
     def undo(self) -> Patch | None:
         """Takes back the last stroke: the open one, one on its way, or a finished one.
@@ -272,7 +193,8 @@ class Session:
           The picture as it was there, None where there is nothing to take back or to show.
         """
         if self._open:
-            job, self._open, self._pen = self._open, None, None
+            job = self._open
+            self._lift()
             return self._uncover(job.number)
         with self._lock:
             job = self._strokes[-1] if self._strokes else None
@@ -319,6 +241,10 @@ class Session:
         self._closed = True
         self._queue.put(None)
         self._worker.join()
+
+    def _lift(self):
+        self._open, self._pen = None, None
+        self._lifted.set()
 
     def _preview(self, track, bounds) -> Patch | None:
         job = self._open
@@ -368,6 +294,7 @@ class Session:
 
     def _work(self):
         while (job := self._queue.get()) is not None:
+            self._lifted.wait()
             with self._lock:
                 if job.cancelled:
                     continue
@@ -377,6 +304,8 @@ class Session:
             def watch(stage, value, box=box, shape=canvas.height.shape):
                 if stage == "brush":
                     box.append(painter.reached(shape, value[1]))
+                jax.block_until_ready(value)
+                self._lifted.wait()
 
             try:
                 color = np.asarray(job.color, np.float32)

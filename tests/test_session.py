@@ -1,6 +1,7 @@
 """The session: previews at once, networks on a thread, undo, errors, recording; nothing is lost."""
 
 import threading
+import time
 import types
 
 import jax
@@ -143,6 +144,31 @@ def test_a_stroke_over_an_unfinished_one(session, fake, brush):
         stroke = make_stroke(path, *pen(path)[::3])
         alone = fake(OPTIONS, None, alone, nobody, np.asarray(color), stroke, lambda *_: None)
     assert np.abs(np.asarray(alone.color) - np.asarray(session.canvas.color)).max() < 1e-6
+
+
+def test_the_networks_rest_while_the_pen_is_down(session, fake, brush):
+    fake.go.clear()
+    draw(session, brush)
+    assert fake.begun.wait(60.0)
+    # The pen comes down while they are at it: they stop after the stage they are in.
+    session.begin(brush, BLUE)
+    t, x, y, press = pen(PATH + [0.0, 3.0])
+    session.add(t[:20], x[:20], y[:20], press[:20])
+    fake.go.set()
+    time.sleep(0.2)
+    assert session.poll() == []
+    session.add(t[20:], x[20:], y[20:], press[20:])
+    session.end()
+    assert session.wait(60.0) and len(session.poll()) == 2
+    # Waiting with the pen down does not wait for the pen; taking the open stroke back lifts it.
+    draw(session, brush)
+    session.begin(brush, BLUE)
+    assert session.wait(60.0) and len(session.poll()) == 1
+    fake.go.clear()
+    session.undo()
+    draw(session, brush)
+    fake.go.set()
+    assert session.wait(60.0)
 
 
 def test_undo_takes_back_open_waiting_and_finished_strokes(session, fake, brush):
