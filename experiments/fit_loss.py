@@ -63,6 +63,17 @@ def target_of(level: Level, exact) -> Target:
     return Target(images=coarse(exact, waves, shape), waves=waves)
 
 
+def unlike(images, target: Target):
+    """Squared difference of images (6, h, w) from a target, relative."""
+    return jnp.sum((images - target.images) ** 2) / jnp.sum(target.images**2)
+
+
+@jax.jit
+def unlike_exact(maps, target: Target):
+    """The same of exact maps."""
+    return unlike(coarse(maps, target.waves, target.images.shape[1:]), target)
+
+
 def compare(pixel: float, longest: float, origin, target: Target, track):
     """Loss of a track against a target, and whether its maps are whole.
 
@@ -78,5 +89,4 @@ def compare(pixel: float, longest: float, origin, target: Target, track):
     exact = trajectory_maps(Grid(shape=fine, origin=origin, pixel=PIXEL), track)
     true = coarse(jax.lax.stop_gradient(exact), target.waves, shape)
     images = drawn + jax.lax.stop_gradient(true - drawn)
-    unlike = jnp.sum((images - target.images) ** 2) / jnp.sum(target.images**2)
-    return unlike, soft.whole
+    return unlike(images, target), soft.whole

@@ -16,8 +16,9 @@ POINTS = 24
 """Control points of the curves in the opening."""
 ENOUGH = 1.0
 """Area of a part that says half as much as the largest could [mm^2]."""
-SMOOTH = 0.1
-"""Weight of the squared third differences of the control points against a part's [mm^2]."""
+SMOOTH = (0.1, 0.03, 0.01)
+"""Weights of the squared third differences of the control points against a part's [mm^2]: the
+first suits most strokes, the last a scribble."""
 
 
 def basis(stamps: int, count: int) -> np.ndarray:
@@ -41,11 +42,12 @@ def moments(maps) -> np.ndarray:
     return np.concatenate([sums[:, :3] / np.maximum(sums[:, 3:], 1e-9), area], axis=1)
 
 
-def moved(curve: np.ndarray, drawn, read) -> np.ndarray:
+def moved(curve: np.ndarray, drawn, read, smooth: float = SMOOTH[0]) -> np.ndarray:
     """The next curve: x, y [mm] and logit of the pressure, (t, 3).
 
     Args:
       curve: (t, 3), evenly spaced in time. drawn: its exact maps. read: the maps to match.
+      smooth: one of SMOOTH.
     """
     now, then = moments(drawn), moments(read)
     area = np.minimum(now[:, 3], then[:, 3])
@@ -55,6 +57,6 @@ def moved(curve: np.ndarray, drawn, read) -> np.ndarray:
     at = np.linspace(0.0, len(curve) - 1.0, BINS)
     wanted = np.stack([np.interp(at, np.arange(len(curve)), x) for x in curve.T], 1) + step
     b, bend = basis(BINS, POINTS), np.diff(np.eye(POINTS), 3, axis=0)
-    matrix = b.T @ (trust[:, None] * b) + SMOOTH * bend.T @ bend
+    matrix = b.T @ (trust[:, None] * b) + smooth * bend.T @ bend
     points = np.linalg.solve(matrix, b.T @ (trust[:, None] * wanted))
     return basis(len(curve), POINTS) @ points

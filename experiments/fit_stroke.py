@@ -25,8 +25,8 @@ from rich.progress import Progress
 
 from experiments.common import console, results_folder, write_run
 from experiments.fit_drawing import Show, chart, film, report, strip
-from experiments.fit_loss import PIXEL, Level, compare, target_of
-from experiments.fit_opening import basis, moved
+from experiments.fit_loss import PIXEL, Level, compare, target_of, unlike_exact
+from experiments.fit_opening import SMOOTH, basis, moved
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
 from jaxbrush.raster import Grid, TrajectoryMaps, trajectory_maps
 from jaxbrush.structs import config, state
@@ -41,8 +41,8 @@ BAR = 0.5 * PIXEL
 """Success: rms path error below half a pixel [mm]."""
 FOUND = ("s_curve", "arc", "scribble", "hook", "straight", "arc")
 """Kinds of the strokes, in turn; dabs are shorter than the way to go."""
-OPENING = 8
-"""Steps of the opening."""
+OPENING = 20
+"""Steps of the opening, for each of its smoothnesses."""
 LEVELS = (
     Level(0.8, (1, 3), 80, (0.05, 0.02), (1, 1, 0.7, 0)),
     Level(0.4, (2, 6), 60, (0.03, 0.01), (1, 1, 0.7, 0.2)),
@@ -52,9 +52,11 @@ LEVELS = (
 WEAK = 1e-3
 """Slope [1/mm] of the loss below which Adam's steps shrink: where a brush hardly touches, it would
 else go as far along the noise as it goes elsewhere along the slope."""
-PRIOR = 1e-10
-"""Weight of the squared jerk [mm per stroke time^3] of the path where the pen barely presses: it
-leaves no trace there, and goes on as it came."""
+PRIOR = 4e-3
+"""Weight of the logarithm of the path's mean squared jerk: a hand is smooth, how smooth is not
+known. Without it, ends that the maps hardly show go astray, with 100 times the jerk."""
+CALM = 1e5
+"""Mean squared jerk [(mm per stroke time^3)^2] below which a path is as smooth as any."""
 
 
 @state
@@ -122,12 +124,10 @@ def astray(key, stroke: Stroke, distance: float):
 
 
 def prior(unknown: Unknown, known: Stroke):
-    """Penalty on the jerk of the path where the pen barely presses."""
-    stroke = stroke_of(unknown, known)
-    count = stroke.time.shape[0] - 1
-    jerk = jnp.diff(stroke.position, n=3, axis=0) * float(count) ** 3
-    light = jax.lax.stop_gradient(jnp.exp(-stroke.pressure[1:-2] / 0.04))
-    return PRIOR * jnp.mean(light * jnp.sum(jerk**2, axis=1))
+    """Penalty on the jerk of the path: Gaussian of unknown variance, so its logarithm."""
+    position = _curve(unknown.path, known.time.shape[0])
+    jerk = jnp.diff(position, n=3, axis=0) * float(known.time.shape[0] - 1) ** 3
+    return PRIOR * jnp.log(CALM + jnp.mean(jnp.sum(jerk**2, axis=1)))
 
 
 Tools = namedtuple("Tools", "draw slope move optimizer")
@@ -174,6 +174,26 @@ def make_tools(setting: Setting, levels) -> Tools:
 _shape = jax.jit(stroke_of)
 
 
+def opened(tools: Tools, level, case: "Case"):
+    """Moves the start of a case to where its maps say the brush was, smoothly and less so.
+
+    Returns:
+      (curves, curve): OPENING of them, (t, 3), and that of these whose maps are the most alike.
+    """
+    target = target_of(level, case.exact)
+    ways = []
+    for smooth in SMOOTH:
+        curve, passed = np.asarray(case.start, float), []
+        for _ in range(OPENING):
+            track = tools.draw(with_curve(case.true, curve[:, :2], curve[:, 2]), case.brush)
+            maps = exact_maps(case.origin, track)
+            passed.append((float(unlike_exact(maps, target)), curve))
+            curve = moved(curve, maps, case.exact, smooth)
+        ways.append(passed)
+    best = min(ways, key=lambda passed: min(loss for loss, _ in passed))
+    return [curve for _, curve in best], min(best, key=lambda x: x[0])[1]
+
+
 def fit(setting: Setting, tools: Tools, levels, case: "Case", watch=lambda *_: None) -> Stroke:
     """Opens from the start of a case, then descends through the levels.
 
@@ -184,11 +204,9 @@ def fit(setting: Setting, tools: Tools, levels, case: "Case", watch=lambda *_: N
       The stroke that was found.
     """
     known, brush, origin = case.true, case.brush, case.origin
-    curve = np.asarray(case.start, float)
-    for _ in range(OPENING):
-        stroke = with_curve(known, curve[:, :2], curve[:, 2])
-        watch(stroke, None, True)
-        curve = moved(curve, exact_maps(origin, tools.draw(stroke, brush)), case.exact)
+    curves, curve = opened(tools, levels[0], case)
+    for x in curves:
+        watch(with_curve(known, x[:, :2], x[:, 2]), None, True)
     unknown = unknown_of(curve, setting.scales)
     memory = tools.optimizer.init(unknown)
     for level in levels:
