@@ -46,6 +46,29 @@ def test_dragged_paint_follows_brinkmans_profile_to_second_order(x64):
     assert np.all(np.diff(order) > 0.0) and order[-1] > 1.8
 
 
+def test_paint_under_a_dragged_layer_follows_couettes_profile(x64):
+    """Hair in the uppermost layer only: below it u'' = r u, r the drag at rest that keeps dry cells
+    from being singular, so u = sinh(sqrt(r) z) / sinh(sqrt(r) z_top) of the top's: nearly a line."""
+    params, layers, deep = make_params(), 16, 0.5
+    config = PaintConfig(
+        layers=layers + 1, layer=deep / layers, window=8, viscous=600, spectrum=0.97
+    )
+    n = config.window**2
+    fill = jnp.ones((layers + 1, n)).at[layers].set(0.0)
+    hair = jnp.zeros(fill.shape).at[layers - 1].set(0.5)
+    motion = jnp.zeros((layers + 1, 3, n)).at[:, 0].set(1.0)
+    u, left = jax.jit(viscous, static_argnums=0)(config, params, fill, hair, motion)
+    assert float(left[0]) < 1e-9
+    speed = np.asarray(u)[:layers, 0, config.window : -config.window].mean(1)
+    k, z = np.sqrt(1e-3) / config.pixel, (np.arange(layers) + 0.5) * config.layer
+    want = speed[-1] * np.sinh(k * z) / np.sinh(k * z[-1])
+    print("off by", np.abs(speed - want).max(), "top", speed[-1])
+    assert 0.5 < speed[-1] < 1.0
+    np.testing.assert_allclose(speed, want, atol=1e-4)
+    # Without drag, or with no hold on the canvas, it would move as a block or not at all.
+    assert speed[0] < 0.05 * speed[-1] and np.all(np.diff(speed) > 0.0)
+
+
 def films(*changes, step=0.06):
     """Film [mm] of the shared stroke, stamps `step` apart [mm], for settings `changes`."""
     moves = track(step=step, stamps=round(64 * 0.06 / step))
