@@ -48,7 +48,7 @@ class Config:
     recording: Path | None = None
     """A session as paint_session reads it [default: the sea that comes along]."""
     strokes: int | None = None
-    """The first so many only."""
+    """So many strokes: the first ones, or more than there are, painted again over themselves."""
     weights: tuple[Path, Path] = engines.SHIPPED
     """Height and color network."""
     fast: tuple[Path, Path] | None = None
@@ -190,7 +190,9 @@ def main(options: Config) -> None:
         session = paint_session.read(options.recording)
         side = np.asarray(session.canvas)[::-1] / engines.PIXEL
         shape = tuple(int(n) for n in np.ceil(side))
-        deeds = engines.deeds_of(session, shape)[: options.strokes]
+        deeds = engines.deeds_of(session, shape)
+        if deeds and options.strokes is not None:
+            deeds = [deeds[n % len(deeds)] for n in range(options.strokes)]
         made = makers(options, shape, deeds)
     except (ValueError, OSError) as error:
         raise SystemExit(f"{error}") from error

@@ -47,8 +47,8 @@ def test_dragged_paint_follows_brinkmans_profile_to_second_order(x64):
 
 
 def test_paint_under_a_dragged_layer_follows_couettes_profile(x64):
-    """Hair in the uppermost layer only: below it u'' = r u, r the drag at rest that keeps dry cells
-    from being singular, so u = sinh(sqrt(r) z) / sinh(sqrt(r) z_top) of the top's: nearly a line."""
+    """Hair in the uppermost layer only: below it u'' = k^2 u, k^2 the drag at rest that keeps dry
+    cells from being singular, so u = sinh(k z) / sinh(k z_top) of the top's: nearly a line."""
     params, layers, deep = make_params(), 16, 0.5
     config = PaintConfig(
         layers=layers + 1, layer=deep / layers, window=8, viscous=600, spectrum=0.97
