@@ -26,8 +26,9 @@ class Config(training.Options):
     """Data set (see make_dataset)."""
     data: Path | None = None
     """Folder of the data set [default: results/data_<preset>]."""
-    sweeps: bool = False
-    """Height: the sweep count in place of the pressure (paper Figure 3)."""
+    hand: Literal["pressure", "sweeps", "both"] = "both"
+    """Height: what it is told of the hand: the pressure map (the paper's way), the sweep count (its
+    Figure 3), or both."""
     time: bool = True
     """Color: with the time map (paper Figure 4)."""
     height: bool = True
@@ -59,7 +60,7 @@ class Stored:
 def batch_of(raw: dict, kind: str, options: Config):
     """Inputs, target and mask of a network, as the options ask for."""
     if kind == "height":
-        return data.height_batch(raw, options.sweeps)
+        return data.height_batch(raw, options.hand)
     return data.color_batch(raw, options.time, options.height)
 
 
@@ -110,7 +111,7 @@ def main(kind: str, options: Config) -> None:
             take("test", np.arange(tests)),
             scale,
             data=about,
-            inputs={"sweeps": options.sweeps, "time": options.time, "height": options.height},
+            inputs={"hand": options.hand, "time": options.time, "height": options.height},
             command=f"python -m experiments.train_{kind} {' '.join(sys.argv[1:])}".strip(),
         )
     except (ValueError, training.NotFinite) as error:

@@ -34,7 +34,7 @@ from jaxbrush.stages import (
 from jaxbrush.stages import paint_on as paint_on
 from jaxbrush.stylus import Stroke, stamps_needed
 
-HEIGHT_INPUTS, COLOR_INPUTS = 2, 8
+HEIGHT_INPUTS, COLOR_INPUTS = 3, 8
 
 
 def make_nets(height: checkpoint.Exported, color: checkpoint.Exported) -> Nets:

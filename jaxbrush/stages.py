@@ -107,12 +107,13 @@ class Nets:
 
 @state
 class Drawn:
-    """Maps of a stroke on the grid of its box: pressure, time (h, w, 1), trajectory (h, w, 3) in
-    sRGB, as in a training pair; mask: (h, w, 1) as there, 0 off the canvas. share: (h, w, 1) of
-    what is painted in what the canvas becomes: 1 where bristles came, falling to 0 within `RIM`.
-    whole: () as in TrajectoryMaps."""
+    """Maps of a stroke on the grid of its box: pressure, sweeps, time (h, w, 1), trajectory
+    (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as there, 0 off the canvas. share:
+    (h, w, 1) of what is painted in what the canvas becomes: 1 where bristles came, falling to 0
+    within `RIM`. whole: () as in TrajectoryMaps."""
 
     pressure: jax.Array
+    sweeps: jax.Array
     time: jax.Array
     trajectory: jax.Array
     mask: jax.Array
@@ -220,6 +221,7 @@ def draw(
     share, grown = faded(cover)
     return Drawn(
         pressure=maps.pressure[..., None],
+        sweeps=maps.sweeps[..., None],
         time=time[..., None],
         trajectory=maps.color,
         mask=inside * dilate(grown, REACH - RIM)[..., None],
@@ -237,10 +239,10 @@ def cut(
       layout: of the box; a Rect is its own.
 
     Returns:
-      dict of height [mm], pressure, time, mask, share (n, size, size, 1), color, trajectory (n,
-      size, size, 3) in sRGB; of a Rect one, of its sides.
+      dict of height [mm], pressure, sweeps, time, mask, share (n, size, size, 1), color, trajectory
+      (n, size, size, 3) in sRGB; of a Rect one, of its sides.
     """
-    names = ("pressure", "time", "mask", "share", "trajectory")
+    names = ("pressure", "sweeps", "time", "mask", "share", "trajectory")
     field = jnp.concatenate([getattr(drawn, name) for name in names], axis=-1)
     if isinstance(box, Rect):
         field, corner = field[None], box.corner[None]
@@ -250,7 +252,7 @@ def cut(
     return {
         "height": patches.cut_canvas(canvas.height, corner, sides)[..., None],
         "color": to_srgb(patches.cut_canvas(canvas.color, corner, sides)),
-        **dict(zip(names, jnp.split(field, (1, 2, 3, 4), axis=-1), strict=True)),
+        **dict(zip(names, jnp.split(field, (1, 2, 3, 4, 5), axis=-1), strict=True)),
     }
 
 
@@ -300,8 +302,7 @@ def evaluate(
     # Chosen where there is none: a root has no slope at 0.
     press = jnp.where(pairs["pressure"] > 0.0, pairs["pressure"], 0.0)
     given = pairs | {
-        "height": before, "pressure": press, "sweeps": jnp.zeros_like(press),
-        "new_height": before, "new_color": pairs["color"],
+        "height": before, "pressure": press, "new_height": before, "new_color": pairs["color"],
     }  # fmt: skip
     height = run(nets.height_config, nets.height, data.height_batch(given).inputs)
     laid = height

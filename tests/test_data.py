@@ -71,11 +71,14 @@ def test_a_stroke_changes_its_mask_and_is_the_next_background(folder):
 def test_batches_are_in_network_scale(folder):
     p = data.load(folder).take("test", [0, 1])
     height = data.height_batch(p)
-    assert height.inputs.shape == (2, 48, 48, 2) and height.target.shape == (2, 48, 48, 1)
+    assert height.inputs.shape == (2, 48, 48, 3) and height.target.shape == (2, 48, 48, 1)
     color = data.color_batch(p)
     assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
     assert data.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
-    for batch in (height, color, data.height_batch(p, sweeps=True)):
+    alone = [data.height_batch(p, hand) for hand in ("pressure", "sweeps")]
+    np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
+    np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
+    for batch in (height, color, *alone):
         for x in jax.tree.leaves(batch):
             assert x.dtype == np.float32
             assert float(x.min()) >= -1.0 and float(x.max()) <= 1.0
@@ -147,7 +150,7 @@ def test_long_strokes_fit_their_stamps():
 
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
-    for kind, outputs, channels in (("height", 1, 2), ("color", 3, 8)):
+    for kind, outputs, channels in (("height", 1, 3), ("color", 3, 8)):
         options = GeneratorConfig(outputs, width=0.05)
         variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
@@ -214,7 +217,7 @@ def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
 def test_predicted_heights_are_laid_as_in_use(folder):
     found = data.load(folder)
     config = GeneratorConfig(outputs=1, width=0.05)
-    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 2)))
+    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 3)))
     network = checkpoint.Exported(variables, config, {})
     index = np.arange(found.count("train"))
     heights = train_network.predicted_heights(found, "train", index, network)

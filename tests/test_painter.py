@@ -40,7 +40,7 @@ def network(inputs, outputs, norm="instance", width=0.05):
     return checkpoint.Exported(jax.tree.map(draw, shape), config, {"made by": "a test"})
 
 
-NETS = painter.make_nets(network(2, 1), network(8, 3))
+NETS = painter.make_nets(network(3, 1), network(8, 3))
 
 
 LONG = jax.tree.map(np.asarray, make_stroke(np.zeros((80, 2)), pressure=0.6))
@@ -202,14 +202,15 @@ def test_networks_see_what_they_were_trained_on():
         np.asarray(to_srgb(jnp.asarray(PAINT))), abs=1e-6
     )
     zero = np.zeros_like(pair["height"])
-    pair |= {"sweeps": zero, "new_height": zero, "new_color": pair["color"]}
+    assert pair["sweeps"].max() >= 1.0
+    pair |= {"new_height": zero, "new_color": pair["color"]}
 
     @jax.jit
     def by_hand(pair):
         run = lambda net, x: image_scale(  # noqa: E731
             Generator(net.config).apply(net.variables, x)
         )
-        height = run(network(2, 1), data.height_batch(pair).inputs)
+        height = run(network(3, 1), data.height_batch(pair).inputs)
         new = data.LEVELS["height"] * height - pair["height"]
         new = pair["height"] + pair["share"] * new
         color = run(network(8, 3), data.color_batch(pair | {"new_height": new}).inputs)
@@ -326,7 +327,8 @@ def test_moments_of_the_whole_stroke_leave_no_seam():
     mask[44:125, 44:125] = 1.0
     shade = jnp.linspace(0.1, 2.0, side)[:, None, None] * jnp.asarray(mask)
     drawn = stages.Drawn(
-        pressure=draw(1) * shade, time=draw(1) * shade, trajectory=draw(3) * jnp.asarray(mask),
+        pressure=draw(1) * shade, sweeps=9.0 * draw(1) * shade, time=draw(1) * shade,
+        trajectory=draw(3) * jnp.asarray(mask),
         mask=jnp.asarray(mask), share=jnp.asarray(mask), whole=jnp.asarray(True),
     )  # fmt: skip
 
@@ -379,8 +381,8 @@ def test_the_preview_is_that_of_the_maps():
 
 def test_arguments_are_checked(tmp_path):
     with pytest.raises(ValueError, match="color network has 7 inputs"):
-        painter.make_nets(network(2, 1), network(7, 3))
-    for name, net in (("h", network(2, 1)), ("c", network(8, 3))):
+        painter.make_nets(network(3, 1), network(7, 3))
+    for name, net in (("h", network(3, 1)), ("c", network(8, 3))):
         checkpoint.export(tmp_path / f"{name}.npz", net.config, net.variables, net.card)
     nets = painter.load_nets(tmp_path / "h.npz", tmp_path / "c.npz")
     assert nets.color_config.outputs == 3
