@@ -5,6 +5,7 @@ import functools
 import json
 import os
 import time
+import zlib
 from pathlib import Path
 
 import cv2
@@ -205,7 +206,12 @@ def _start(init, params, pairs: Pairs, options: Options, checkpoints):
     """(state, notes): from the last checkpoint that can be read, or new."""
     few = jax.tree.map(jnp.asarray, pairs.take(np.arange(options.batch)))
     key = jax.random.key(options.seed)
-    notes = {"seed": options.seed, "batch": options.batch, "pairs": len(pairs)}
+    # Whole numbers, so that no rounding of a device changes them.
+    first = np.round(32767.5 * (np.nan_to_num(few.target) + 1.0)).astype(np.uint16)
+    notes = {
+        "seed": options.seed, "batch": options.batch, "pairs": len(pairs),
+        "checksum of the first pairs": zlib.crc32(first.tobytes()),
+    }  # fmt: skip
     folder = checkpoints.directory
     if not options.resume:
         if checkpoints.all_steps():

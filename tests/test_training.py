@@ -168,16 +168,24 @@ def test_fit_beats_half_of_copying_the_background(tmp_path):
 
 
 @pytest.mark.slow
-def test_killed_run_resumes_to_the_same_bits(tmp_path):
+def test_killed_run_resumes_to_the_same_bits(tmp_path, monkeypatch):
     train, held = toy(5, side=16), toy(2, side=16, seed=1)
-    few = dataclasses.replace(SMALL, steps=2)
     _, straight, _ = training.run(SMALL, "height", train, held, tmp_path / "a")
-    training.run(few, "height", train, held, tmp_path / "b")
+
+    def kill(*_):
+        raise KeyboardInterrupt
+
+    # A shorter run would do for a killed one, but its rates fall faster.
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(training, "sample_grid", kill)
+        training.run(SMALL, "height", train, held, tmp_path / "b")
     with pytest.raises(ValueError, match="has checkpoints: resume them"):
         training.run(SMALL, "height", train, held, tmp_path / "b")
     on = dataclasses.replace(SMALL, resume=True)
     with pytest.raises(ValueError, match="seed: 0 saved, 1 given"):
         training.run(dataclasses.replace(on, seed=1), "height", train, held, tmp_path / "b")
+    with pytest.raises(ValueError, match="checksum of the first pairs"):
+        training.run(on, "height", toy(5, side=16, seed=2), held, tmp_path / "b")
     _, resumed, numbers = training.run(on, "height", train, held, tmp_path / "b")
     assert numbers["steps"] == 4 and int(resumed.step) == int(straight.step)
     jax.tree.map(np.testing.assert_array_equal, resumed, straight)
