@@ -298,7 +298,12 @@ def height_batch(pairs: dict, hand: str = "both") -> Batch:
         (its Figure 3), or both. The pressure of the latest bristle says little of where hair is
         dense, and grooves are: on bare canvas their correlation with it is -0.01, with the
         logarithm of the count 0.26.
+
+    Raises:
+      ValueError: another hand.
     """
+    if hand not in HANDS:
+        raise ValueError(f"hand = {hand!r}: expected one of {HANDS}")
     parts = [network_height(pairs["height"])]
     if hand != "sweeps":
         parts.append(network_pressure(jnp.asarray(pairs["pressure"]), touched(pairs)))

@@ -78,6 +78,8 @@ def test_batches_are_in_network_scale(folder):
     alone = [data.height_batch(p, hand) for hand in ("pressure", "sweeps")]
     np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
     np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
+    with pytest.raises(ValueError, match="hand = 'left'"):
+        data.height_batch(p, "left")
     for batch in (height, color, *alone):
         for x in jax.tree.leaves(batch):
             assert x.dtype == np.float32
