@@ -175,7 +175,7 @@ def test_killed_run_resumes_to_the_same_bits(tmp_path, monkeypatch):
     def kill(*_):
         raise KeyboardInterrupt
 
-    # A shorter run would do for a killed one, but its rates fall faster.
+    # Killed, not asked for fewer steps: the rates of a shorter run fall faster.
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
         patch.setattr(training, "sample_grid", kill)
         training.run(SMALL, "height", train, held, tmp_path / "b")
