@@ -19,7 +19,7 @@ from experiments.common import console, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import checkpoint
 from jaxbrush.data import recolored
-from jaxbrush.models import DiscriminatorConfig, GeneratorConfig
+from jaxbrush.models import DiscriminatorConfig, GeneratorConfig, folded
 from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
 
 OUTPUTS = {"height": 1, "color": 3}
@@ -37,6 +37,9 @@ class Options:
     """Time for training in this run, compilation included."""
     resume: bool = False
     """Goes on from the last checkpoint in the folder; without one, starts."""
+    start: Path | None = None
+    """Exported weights to begin from. Of a network with instance normalisation, `--norm none` takes
+    over the moments that it has on average (`models.folded`)."""
     batch: int = 1
     """Pairs an update sees."""
     width: float = 0.25
@@ -96,7 +99,9 @@ def train_config(options: Options, kind: str) -> TrainConfig:
     """The networks that the options ask for."""
     dtype = "bfloat16" if options.bf16 else "float32"
     norm = options.norm
-    judge = DiscriminatorConfig(options.discriminator_width, norm, dtype)
+    # The discriminator is thrown away, so it may see as far as it likes.
+    opposed = "instance" if norm == "none" else norm
+    judge = DiscriminatorConfig(options.discriminator_width, opposed, dtype)
     return TrainConfig(
         GeneratorConfig(OUTPUTS[kind], options.width, norm, options.upsampling, dtype),
         judge if options.gan > 0.0 else None,
@@ -202,7 +207,31 @@ class _Log:
         self.file.flush()
 
 
-def _start(init, params, pairs: Pairs, options: Options, checkpoints):
+LOOK = 128
+"""Pairs at most that moments are taken from."""
+
+
+def _begun(options: Options, state, wanted: GeneratorConfig, pairs: Pairs):
+    """The state with the exported weights that the options name."""
+    have = checkpoint.load(options.start)
+    config, variables = have.config, have.variables
+    if (config.norm, wanted.norm) == ("instance", "none"):
+        index = np.linspace(0, len(pairs) - 1, min(LOOK, len(pairs))).astype(int)
+        pictures = (pairs.take(some).inputs for some in np.array_split(index, -(-len(index) // 8)))
+        config, variables = folded(config, variables, pictures)
+    lines = checkpoint.differences(checkpoint.as_dict(config), checkpoint.as_dict(wanted))
+    inputs = [p["encode1"]["kernel"].shape[2] for p in (variables["params"], state.generator)]
+    if inputs[0] != inputs[1]:
+        lines.append(f"inputs: {inputs[0]} saved, {inputs[1]} given")
+    if lines:
+        raise ValueError(f"{options.start}: is of another network: {'; '.join(lines)}")
+    params = jax.tree.map(jnp.asarray, variables["params"])
+    average = None if state.average is None else jax.tree.map(jnp.copy, params)
+    moments = {k: v for k, v in variables.items() if k != "params"}
+    return dataclasses.replace(state, generator=params, moments=moments, average=average)
+
+
+def _start(init, params, pairs: Pairs, options: Options, chosen: TrainConfig, checkpoints):
     """(state, notes): from the last checkpoint that can be read, or new."""
     few = jax.tree.map(jnp.asarray, pairs.take(np.arange(options.batch)))
     key = jax.random.key(options.seed)
@@ -213,14 +242,17 @@ def _start(init, params, pairs: Pairs, options: Options, checkpoints):
         "checksum of the first pairs": zlib.crc32(first.tobytes()),
     }  # fmt: skip
     folder = checkpoints.directory
-    if not options.resume:
-        if checkpoints.all_steps():
-            raise ValueError(f"{folder} has checkpoints: resume them, or use another folder")
-        # On a named device, as a restored state is: one compilation serves both.
-        return jax.device_put(init(key, few, params), jax.devices()[0]), notes
-    found = checkpoint.restore(checkpoints, jax.eval_shape(init, key, few, params))
+    if not options.resume and checkpoints.all_steps():
+        raise ValueError(f"{folder} has checkpoints: resume them, or use another folder")
+    found = None
+    if options.resume:
+        found = checkpoint.restore(checkpoints, jax.eval_shape(init, key, few, params))
     if found is None:
-        return jax.device_put(init(key, few, params), jax.devices()[0]), notes
+        state = init(key, few, params)
+        if options.start is not None:
+            state = _begun(options, state, chosen.generator, pairs)
+        # On a named device, as a restored state is: one compilation serves both.
+        return jax.device_put(state, jax.devices()[0]), notes
     for step, reason in found.damaged.items():
         console.print(f"[yellow]checkpoint {step} cannot be read and is passed over:[/] {reason}")
         checkpoints.delete(step)
@@ -257,7 +289,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
     last_step = np.inf if options.steps is None else options.steps
 
     with checkpoint.opened(folder / "checkpoints", chosen) as checkpoints:
-        state, notes = _start(init, params, train, options, checkpoints)
+        state, notes = _start(init, params, train, options, chosen, checkpoints)
         step = first = int(jax.device_get(state.step))
         used = 1.0  # factor on the rates
         log = _Log(folder / "metrics.jsonl", options.log_every, step)

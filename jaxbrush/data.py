@@ -24,10 +24,11 @@ from jaxbrush.pairs import PairConfig, Picture, canvas_pairs
 from jaxbrush.structs import config
 from jaxbrush.train import Batch
 
-FORMAT = 2
+FORMAT = 3
 FULL = 65535
-LEVELS = {"height": 1.25, "pressure": 6.0, "sweeps": 64.0}
-"""Values that uint16's 65535 stands for: height [mm], pressure [maps' unit], sweeps; others 1."""
+LEVELS = {"height": 1.25, "pressure": 6.0, "sweeps": 64.0, "time": 64.0}
+"""Values that uint16's 65535 stands for: height [mm], pressure [maps' unit], sweeps, way of the
+brush [mm]; others 1."""
 CHANNELS = (
     ("height", 1), ("color", 3), ("pressure", 1), ("sweeps", 1), ("trajectory", 3), ("time", 1),
     ("new_height", 1), ("new_color", 3), ("mask", 1),
@@ -287,6 +288,17 @@ def network_sweeps(sweeps):
     return _network(jnp.minimum(share, 1.0))
 
 
+WAY = 4.0
+"""[mm] on which the networks' scale of the way is about linear; beyond, it grows as its logarithm,
+so that long strokes keep a slope and stay within what was learned."""
+
+
+def network_time(time):
+    """The time map, the way of the brush [mm], in network scale."""
+    share = jnp.log1p(jnp.maximum(time, 0.0) / WAY) / np.float32(np.log1p(LEVELS["time"] / WAY))
+    return _network(jnp.minimum(share, 1.0))
+
+
 HANDS = ("pressure", "sweeps", "both")
 
 
@@ -325,7 +337,7 @@ def color_batch(pairs: dict, time: bool = True, height: bool = True) -> Batch:
     """
     parts = [_network(jnp.asarray(pairs["color"])), _network(jnp.asarray(pairs["trajectory"]))]
     if time:
-        parts.append(_network(jnp.asarray(pairs["time"])))
+        parts.append(network_time(jnp.asarray(pairs["time"])))
     if height:
         parts.append(network_height(jnp.asarray(pairs["new_height"])))
     return Batch(

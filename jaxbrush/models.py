@@ -11,10 +11,13 @@ modulo 4 is 0, 1, 2 or 3: 14, 15, 12 or 13 before it and 24, 23, 22 or 21 after.
 moments of the normalisation carry anything. A logit of the discriminator sees 37.
 """
 
+import dataclasses
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from flax import linen as nn
 
 from jaxbrush.convolutions import KERNEL, UPSAMPLING, convolve, convolve_up
@@ -28,9 +31,14 @@ MOMENTUM = 0.99
 """Of the running averages of batch normalisation."""
 
 
-def _normal(key, shape, dtype=jnp.float32):
+def _normal(key, shape, dtype=jnp.float32, spread=0.02):
     # Drawn flat: XLA's CPU backend compiles that many times faster.
-    return 0.02 * jax.random.normal(key, (math.prod(shape),), dtype).reshape(shape)
+    return spread * jax.random.normal(key, (math.prod(shape),), dtype).reshape(shape)
+
+
+def _kept(key, shape, dtype=jnp.float32):
+    """A start that keeps the spread of what passes through a ReLU (He et al. 2015)."""
+    return _normal(key, shape, dtype, math.sqrt(2.0 / math.prod(shape[:-1])))
 
 
 def _check(options):
@@ -124,6 +132,8 @@ class Norm(nn.Module):
             weights = _reduced(weights, x.shape[1])
         if self.kind != "batch":
             mean, variance = moments(x, weights, (0, 1, 2) if pooled else (1, 2))
+            if not self.is_initializing():
+                self.sow("seen", "moments", (mean, variance))
         else:
             shape = (1, 1, 1, x.shape[-1])
             means = self.variable("moments", "mean", jnp.zeros, shape, jnp.float32)
@@ -147,10 +157,11 @@ class Conv(nn.Module):
     stride: int = 1
     upsampling: str | None = None
     norm: str = "none"
+    start: Callable = _normal
 
     @nn.compact
     def __call__(self, x, weights=None, pooled=False, train=False):
-        kernel = self.param("kernel", _normal, (KERNEL, KERNEL, x.shape[-1], self.channels))
+        kernel = self.param("kernel", self.start, (KERNEL, KERNEL, x.shape[-1], self.channels))
         kernel = kernel.astype(self.dtype)
         if self.upsampling:
             x = convolve_up(x, kernel, self.upsampling)
@@ -201,8 +212,11 @@ class Generator(nn.Module):
         check_size(inputs.shape)
         weights = _weights_of(c, weights)
 
+        # Nothing else sets the scale where there is no normalisation.
+        begin = _kept if c.norm == "none" else _normal
+
         def layer(name, x, count, stride=1, norm=c.norm, up=None):
-            conv = Conv(_channels(c, count), c.dtype, stride, up, norm, name=name)
+            conv = Conv(_channels(c, count), c.dtype, stride, up, norm, begin, name=name)
             return nn.relu(conv(x, weights, pooled, train))
 
         def join(*parts):
@@ -251,3 +265,44 @@ class Discriminator(nn.Module):
             conv = Conv(_channels(c, count), c.dtype, stride, None, kind, name=f"layer{index}")
             x = nn.leaky_relu(conv(x, weights, pooled, True), 0.2)
         return Conv(1, c.dtype, name="layer5")(x).astype(jnp.float32)
+
+
+def folded(options: GeneratorConfig, variables: dict, pictures) -> tuple[GeneratorConfig, dict]:
+    """A generator without normalisation that does what one with "instance" does at the mean moments
+    of some pictures. It sees what is near a pixel and nothing else: parts of a picture can be
+    painted one by one.
+
+    Args:
+      pictures: batches of inputs (n, h, w, c), as many as represent what it is used on.
+
+    Returns:
+      Its config and variables.
+
+    Raises:
+      ValueError: another norm, or no pictures.
+    """
+    if options.norm != "instance":
+        raise ValueError(f"norm = {options.norm!r}: expected 'instance'")
+
+    @jax.jit
+    def look(variables, inputs):
+        _, found = Generator(options).apply(variables, inputs, mutable=["seen"])
+        return {name: layer["norm"]["moments"][0] for name, layer in found["seen"].items()}
+
+    seen = [jax.device_get(look(variables, inputs)) for inputs in pictures]
+    if not seen:
+        raise ValueError("no pictures: expected some to take the moments from")
+    params = {}
+    for name, layer in variables["params"].items():
+        if name not in seen[0]:
+            params[name] = layer
+            continue
+        mean, variance = (np.concatenate([s[name][k] for s in seen])[:, 0, 0] for k in (0, 1))
+        # Of all pixels of all pictures.
+        spread = np.sqrt(variance.mean(0) + mean.var(0) + EPSILON)
+        factor = layer["norm"]["scale"] / spread
+        params[name] = {
+            "kernel": layer["kernel"] * factor[None, None, None],
+            "bias": layer["norm"]["offset"] - mean.mean(0) * factor,
+        }
+    return dataclasses.replace(options, norm="none"), {"params": params}

@@ -98,7 +98,7 @@ def _put(painted, some, start):
 _needed_stamps = jax.jit(_needed)
 _place_stamps = jax.jit(place_stamps, static_argnames="stamps")
 _trace = jax.jit(_trace_bounds)
-_draw = jax.jit(_draw_and_count)
+draw_on = jax.jit(_draw_and_count)
 _cut = jax.jit(_cut_some, static_argnames="count")
 _evaluate = jax.jit(evaluate)
 _take_some = jax.jit(_take, static_argnames="size")
@@ -107,7 +107,7 @@ _lay = jax.jit(lay)
 _lay_over = jax.jit(lay, donate_argnames="canvas")
 
 
-def _bucket(size: int, buckets) -> int:
+def bucket(size: int, buckets) -> int:
     return next((b for b in buckets if size <= b), buckets[-1])
 
 
@@ -132,7 +132,7 @@ def padded(stroke: Stroke) -> Stroke:
 def _begin(options: PainterConfig, brush: BrushParams, stroke: Stroke):
     """Track and touches of a stroke, stamps in a bucket; not jittable."""
     stroke = padded(stroke)
-    stamps = _bucket(int(_needed_stamps(options, brush, stroke)), options.stamps)
+    stamps = bucket(int(_needed_stamps(options, brush, stroke)), options.stamps)
     return _trace(options, brush, _place_stamps(options, brush, stroke, stamps=stamps))
 
 
@@ -205,7 +205,7 @@ def plan(options: PainterConfig, canvas: Canvas, brush: BrushParams, stroke: Str
         return None
     if isinstance(box, Rect):
         return Sizes(track.time.shape[0], sides=box.sides), box.corner
-    _, need = _draw(options, box, shape, track, jnp.zeros(3))
+    _, need = draw_on(options, box, shape, track, jnp.zeros(3))
     sizes = Sizes(track.time.shape[0], box.cells, _count(options, int(need)))
     return sizes, box.first
 
@@ -233,11 +233,20 @@ def paint_stroke(
     check_canvas(canvas)
     track, bounds = _begin(options, brush, stroke)
     watch("brush", (track, bounds))
+    return paint_track(options, nets, canvas, track, bounds, color, donate, watch)
+
+
+def paint_track(
+    options: PainterConfig, nets: Nets, canvas: Canvas, track, bounds, color,
+    donate: bool = False, watch=lambda stage, value: None,
+) -> Canvas:  # fmt: skip
+    """`paint_stroke` from the track of its bristles on, which is that of `stages.trace`, and its
+    touches."""
     shape = canvas.height.shape
     box = place(options, shape, bounds)
     if box is None:
         return canvas
-    drawn, need = _draw(options, box, shape, track, jnp.asarray(color, float))
+    drawn, need = draw_on(options, box, shape, track, jnp.asarray(color, float))
     watch("maps", drawn)
     need = int(need)
     if not need:
@@ -279,7 +288,7 @@ def preview_stroke(
     if box is None:
         return canvas
     color = jnp.asarray(color, float)
-    drawn, _ = _draw(options, box, canvas.height.shape, track, color)
+    drawn, _ = draw_on(options, box, canvas.height.shape, track, color)
     return (_preview_over if donate else _preview)(options, box, drawn, canvas, color)
 
 

@@ -27,7 +27,7 @@ from jaxbrush.paint import (
 from jaxbrush.raster import make_grid, trajectory_maps
 from jaxbrush.raster.grid import dilate
 from jaxbrush.structs import config, state
-from jaxbrush.stylus import Stroke, random_stroke, resample, transform
+from jaxbrush.stylus import Stroke, random_stroke, resample, transform, way
 
 SHAPES = ("flat", "filbert", "round")
 COAT = 0.2
@@ -78,8 +78,9 @@ class Picture:
     """What a pair stores of a canvas and a stroke; colors in sRGB, [0, 1].
 
     height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
-    time: (h, w) and trajectory: (h, w, 3) maps of the stroke. mask: (h, w) 1 where it may have
-    changed something. reached: () whether the brush stayed inside the simulated window.
+    time: (h, w) and trajectory: (h, w, 3) maps of the stroke; time by the clock of `on_way` [mm].
+    mask: (h, w) 1 where it may have changed something. reached: () whether the brush stayed inside
+    the simulated window.
     """
 
     height: jax.Array
@@ -161,6 +162,23 @@ def coated(track: BristleTrack, coat: float = COAT) -> BristleTrack:
     return dataclasses.replace(track, force=jnp.where(near, jnp.maximum(track.force, 1e-3), 0.0))
 
 
+def on_way(track: BristleTrack, stroke: Stroke, depth) -> BristleTrack:
+    """The track with the way of the handle [mm] for its clock.
+
+    Paint is dragged by the way, not by the time a hand takes; and the way so far is known while
+    the stroke goes on, where the paper's share of its duration is not.
+
+    Args:
+      stroke: that the track follows. depth: of the brush at full pressure [mm].
+    """
+    return dataclasses.replace(track, time=way(stroke, depth))
+
+
+def clock_map(share, track: BristleTrack):
+    """The time map of `trajectory_maps`, a share of the stroke, by the clock of its track."""
+    return share * jnp.max(jnp.where(track.valid, track.time, 0.0))
+
+
 def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
     """Paints one stroke of a plan. Pure; jit and vmap it.
 
@@ -188,7 +206,8 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
         thick, options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
     ).color[0, 0]
     grid = make_grid((options.size, options.size), pixel=options.paint.pixel)
-    maps = trajectory_maps(grid, coated(track), to_srgb(own))
+    drawn = on_way(coated(track), plan.stroke, plan.brush.press_depth)
+    maps = trajectory_maps(grid, drawn, to_srgb(own))
     before, now = seen(canvas), seen(after)
     return after, Picture(
         height=before.height,
@@ -196,7 +215,7 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
         pressure=maps.pressure,
         sweeps=maps.sweeps,
         trajectory=maps.color,
-        time=maps.time,
+        time=clock_map(maps.time, drawn),
         new_height=now.height,
         new_color=to_srgb(now.color),
         mask=dilate(maps.coverage, REACH),

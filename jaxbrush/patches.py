@@ -133,7 +133,8 @@ def rect_of(low, high, margin: int, canvas, buckets) -> Rect | None:
       low, high: (2,) int y, x on the canvas. canvas: (h, w). buckets: sides, rising [pixels].
     """
     canvas = np.asarray(canvas, int)
-    low = np.maximum(np.asarray(low, int) - margin, 0)
+    # Networks tell pixels apart by their number modulo 4, so rectangles begin where patches may.
+    low = np.maximum(np.asarray(low, int) - margin, 0) // 4 * 4
     high = np.minimum(np.asarray(high, int) + margin, canvas)
     sides = [next((b for b in buckets if n <= b), None) for n in high - low]
     if None in sides:
@@ -142,6 +143,8 @@ def rect_of(low, high, margin: int, canvas, buckets) -> Rect | None:
     corner = (low + high - sides) // 2
     # Inside the canvas; where it is smaller, about its middle.
     corner = np.where(room >= 0, np.clip(corner, 0, np.maximum(room, 0)), room // 2)
+    corner = np.minimum(corner // 4 * 4, low)
+    corner = np.maximum(corner, -(-(high - sides) // 4) * 4)
     return Rect(corner=jnp.asarray(corner, jnp.int32), sides=tuple(sides))
 
 

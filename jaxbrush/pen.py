@@ -1,12 +1,14 @@
 """A stroke under the pen: its samples so far, and the brush moved along them piece by piece."""
 
+import dataclasses
+
 import jax
 import numpy as np
 
 from jaxbrush.brush import BrushParams, advance, begin
 from jaxbrush.painter import PainterConfig
 from jaxbrush.pairs import coated
-from jaxbrush.stages import touches
+from jaxbrush.stages import on_steps, touches
 from jaxbrush.stylus import Stroke, make_stroke
 
 PIECE = 32
@@ -15,9 +17,9 @@ FIELDS = ("time", "x", "y", "pressure", "altitude", "azimuth", "twist")
 _UPRIGHT = {"altitude": 0.5 * np.pi, "azimuth": 0.0, "twist": 0.0}
 
 
-def _piece(options: PainterConfig, brush, motion, stroke):
+def _piece(options: PainterConfig, brush, motion, stroke, way):
     track, motion = advance(options.brush, brush, motion, stroke)
-    track = coated(track)
+    track = on_steps(options, dataclasses.replace(coated(track), time=way))
     return track, touches(options, track), motion
 
 
@@ -33,7 +35,7 @@ class Pen:
         self.depth = float(brush.press_depth)
         self.samples = {name: np.zeros(0) for name in FIELDS}
         self.way = np.zeros(0)
-        self.motion, self.done = None, 0
+        self.motion, self.done, self.tip = None, 0, None
 
     def add(self, new: dict):
         """Takes samples, and measures the way to each in stamps, as `stylus.resample` does."""
@@ -44,12 +46,13 @@ class Pen:
         steps = np.sqrt(d[0] ** 2 + d[1] ** 2 + (self.depth * d[2]) ** 2) / self.options.pixel
         self.samples, self.way = joined, np.concatenate([[0.0], np.cumsum(steps)])
 
-    def _stamps(self, first: int) -> Stroke:
-        """PIECE + 1 stamps from number `first` on; those past the pen repeat its place."""
+    def _stamps(self, first: int):
+        """PIECE + 1 stamps from number `first` on, and their ways [mm]; those past the pen repeat
+        its place."""
         number = first + np.arange(PIECE + 1)
         at = np.minimum(number, self.way[-1])
         now = {n: np.interp(at, self.way, self.samples[n]).astype(np.float32) for n in FIELDS}
-        return Stroke(
+        stroke = Stroke(
             time=now["time"] - np.float32(self.samples["time"][0]),
             position=np.stack([now["x"], now["y"]], 1),
             pressure=now["pressure"],
@@ -58,18 +61,22 @@ class Pen:
             twist=now["twist"],
             valid=number < np.ceil(self.way[-1]) + 1,
         )
+        return stroke, (at * self.options.pixel).astype(np.float32)
 
     def advance(self):
-        """(track, touches) of each piece that is new or has grown."""
+        """(track, touches, final) of each piece that is new or has grown; tracks by the clock of
+        the way, as `stages.trace`. A piece repeats the last stamp of the one before."""
         config = self.options.brush
         if self.motion is None:
-            self.motion = _begin(config, self.brush, self._stamps(0))
+            self.motion = _begin(config, self.brush, self._stamps(0)[0])
         while True:
-            piece = self._stamps(self.done)
-            track, bounds, motion = _advance(self.options, self.brush, self.motion, piece)
-            yield track, bounds
+            piece, way = self._stamps(self.done)
+            track, bounds, motion = _advance(self.options, self.brush, self.motion, piece, way)
             # Only once the pen is past it, a piece is what it will stay.
-            if self.way[-1] < self.done + PIECE:
+            final = self.way[-1] >= self.done + PIECE
+            self.tip = track, bounds
+            yield track, bounds, final
+            if not final:
                 return
             self.motion, self.done = motion, self.done + PIECE
 

@@ -1,7 +1,7 @@
 """A painting in progress: pen samples in, a preview at once, the networks' paint when it is done.
 
 The only object with a life of its own in this package: it holds a canvas, a thread that runs the
-networks stroke by stroke, and what undo needs. All that computes is in `painter`.
+networks stroke by stroke, and what undo needs. All that computes is in `painter` and `stream`.
 """
 
 import collections
@@ -18,17 +18,19 @@ from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
 from jaxbrush.data import PREVIEW_FILM
 from jaxbrush.painter import Nets, PainterConfig
+from jaxbrush.patches import Box
 from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.recordings import BrushEvent, ColorEvent, StrokeEvent
 from jaxbrush.recordings import Session as Recording
+from jaxbrush.stream import Stream, local
 from jaxbrush.stylus import Stroke
 
 
 @dataclasses.dataclass(frozen=True)
 class Patch:
     """A part of the picture that is new. stroke: number of the stroke, from 1. corner: first pixel
-    (y, x). canvas: of numpy arrays. final: False for a preview. error: what stopped the networks;
-    the preview then stays."""
+    (y, x). canvas: of numpy arrays. final: False for a preview, and for what the networks have
+    painted of a stroke that goes on. error: what stopped the networks; the preview then stays."""
 
     stroke: int
     corner: tuple[int, int]
@@ -39,7 +41,8 @@ class Patch:
 
 @dataclasses.dataclass(eq=False)
 class _Job:
-    """A stroke on its way. box: (y, x) slices that it may change, once known."""
+    """A stroke on its way. box: (y, x) slices that it may change, once known. bounds: of its final
+    pieces. long: whether it is painted while it goes on, by `stream`."""
 
     number: int
     brush: BrushParams
@@ -51,13 +54,18 @@ class _Job:
     box: tuple[slice, slice] | None = None
     before: Canvas | None = None
     error: Exception | None = None
+    bounds: list[np.ndarray] = dataclasses.field(default_factory=list)
+    long: bool = False
+    stream: Stream | None = None
 
 
 class Session:
     """Paints while the pen moves.
 
     The pen goes first: while it is down the networks rest, between the stages of a stroke, so that
-    previews find the processor free. They go on when it is lifted, or in `wait` and `close`.
+    previews find the processor free. They go on when it is lifted, or in `wait` and `close`; or
+    when the stroke under it has become too long to be painted in one piece. Then networks that see
+    only what is near (`stream.local`) paint what the brush has left behind.
 
     Call from one thread. `begin`, `add`, `end` draw a stroke; each returns in a frame. `poll` gives
     what the networks have finished since. `with Session(...) as session` closes it at the end.
@@ -87,6 +95,7 @@ class Session:
         self._news: list[Patch] = []
         self._strokes: list[_Job] = []
         self._count, self._open, self._pen, self._closed = 0, None, None, False
+        self._streams = nets is not None and local(nets) and paint is painter.paint_stroke
         self._worker = threading.Thread(target=self._work, name="painter", daemon=True)
         self._worker.start()
 
@@ -148,8 +157,23 @@ class Session:
         if not new["x"].size:
             return []
         self._pen.add(new)
-        found = [self._preview(*piece) for piece in self._pen.advance()]
+        found = []
+        for track, bounds, final in self._pen.advance():
+            found.append(self._preview(track, bounds))
+            if final and self._streams:
+                self._flow(track, bounds)
         return [patch for patch in found if patch]
+
+    def _flow(self, track, bounds):
+        """Hands a piece to the networks' thread, and wakes it where the stroke is long."""
+        job = self._open
+        self._queue.put((job, (track, bounds)))
+        job.bounds.append(np.asarray(bounds))
+        if not job.long:
+            box = painter.place(self.options, self._owner.shape, np.concatenate(job.bounds))
+            job.long = isinstance(box, Box)
+        if job.long:
+            self._lifted.set()
 
     def end(self) -> int:
         """Lifts the brush; the networks take over. Returns the number of the stroke.
@@ -162,11 +186,13 @@ class Session:
         job, pen = self._open, self._pen
         self._lift()
         if pen.samples["x"].size:
+            if self._streams:
+                self._queue.put((job, pen.tip))
             job.stroke, job.samples = pen.stroke(), pen.samples
             with self._lock:
                 self._strokes.append(job)
                 self._waiting.append(job)
-            self._queue.put(job)
+            self._queue.put((job, None))
         return job.number
 
     def poll(self) -> list[Patch]:
@@ -174,7 +200,7 @@ class Session:
         with self._lock:
             news, self._news = self._news, []
         for patch in news:
-            self._show(patch.corner, patch.canvas, patch.stroke)
+            self._show(patch.corner, patch.canvas, patch.stroke, patch.final)
         return news
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -182,7 +208,7 @@ class Session:
         self._lifted.set()
         with self._idle:
             done = self._idle.wait_for(lambda: not self._waiting, timeout)
-        if self._open:
+        if self._open and not self._open.long:
             self._lifted.clear()
         return done
 
@@ -194,6 +220,9 @@ class Session:
         """
         if self._open:
             job = self._open
+            with self._lock:
+                job.cancelled = True
+                self._news = [p for p in self._news if p.stroke != job.number]
             self._lift()
             return self._uncover(job.number)
         with self._lock:
@@ -269,14 +298,14 @@ class Session:
         part = Canvas(height.copy(), color.copy())
         return Patch(job.number, tuple(int(x) for x in low), part, False)
 
-    def _show(self, corner, part: Canvas, number: int):
-        """Puts a finished part where no later preview is."""
+    def _show(self, corner, part: Canvas, number: int, final: bool = True):
+        """Puts a part where no later preview is; what is not final can be taken away again."""
         h, w = part.height.shape
         at = (slice(corner[0], corner[0] + h), slice(corner[1], corner[1] + w))
         take = self._owner[at] <= number
         self._shown.height[at][take] = part.height[take]
         self._shown.color[at][take] = part.color[take]
-        self._owner[at][take] = 0
+        self._owner[at][take] = 0 if final else number
 
     def _uncover(self, number: int) -> Patch | None:
         """Takes the preview of a stroke away."""
@@ -293,33 +322,71 @@ class Session:
         return Patch(number, corner, jax.tree.map(lambda x: x[at].copy(), self._shown), False)
 
     def _work(self):
-        while (job := self._queue.get()) is not None:
-            self._lifted.wait()
-            with self._lock:
-                if job.cancelled:
-                    continue
-                canvas = self._canvas
-            box = []
-
-            def watch(stage, value, box=box, shape=canvas.height.shape):
-                if stage == "brush":
-                    box.append(painter.reached(shape, value[1]))
-                jax.block_until_ready(value)
-                self._lifted.wait()
-
+        while (item := self._queue.get()) is not None:
+            job, piece = item
+            if job.cancelled:
+                continue
             try:
-                color = np.asarray(job.color, np.float32)
-                new = self._paint(
-                    self.options, self._nets, canvas, job.brush, color, job.stroke, watch=watch
-                )
-                new = jax.block_until_ready(new)
+                if piece is not None:
+                    self._paint_left(job, piece)
+                    continue
+                self._lifted.wait()
+                new, box = self._paint_job(job)
             except Exception as error:  # whatever it is, the painter must be told and go on
-                new, job.error = None, error
+                job.error = error
+                if piece is not None:
+                    continue
+                new, box = None, None
             with self._lock:
                 if not job.cancelled:
-                    self._finish(job, canvas, new, box[0] if box else None)
+                    self._finish(job, self._canvas, new, box)
                     self._waiting.remove(job)
                     self._idle.notify_all()
+            job.stream = None
+
+    def _paint_left(self, job: _Job, piece):
+        """Paints what the brush has left, where the stroke is long."""
+        if job.error:
+            return
+        if job.stream is None:
+            # Strokes before this one are done: the queue keeps their order.
+            color = np.asarray(job.color, np.float32)
+            job.stream = Stream(self.options, self._nets, self._canvas, color)
+        job.stream.add(*piece)
+        if not (job.long and job.stream.fits):
+            return
+        for cell in job.stream.left():
+            corner, part = job.stream.paint(cell)
+            with self._lock:
+                if job.cancelled:
+                    return
+                self._news.append(Patch(job.number, corner, part, False))
+
+    def _paint_job(self, job: _Job):
+        """(Canvas, slices that the stroke may change) of a stroke that is ended."""
+        if job.error:
+            raise job.error
+        stream = job.stream if job.stream is not None and job.stream.fits else None
+        if job.long and stream is not None:
+            box = painter.reached(self._owner.shape, stream.bounds)
+            return stream.result(self._lifted.wait), box
+        box = []
+
+        def watch(stage, value):
+            if stage == "brush":
+                box.append(painter.reached(self._owner.shape, value[1]))
+            jax.block_until_ready(value)
+            self._lifted.wait()
+
+        color = np.asarray(job.color, np.float32)
+        given = self.options, self._nets, self._canvas
+        if stream is not None:
+            found = stream.track(), stream.bounds
+            watch("brush", found)
+            new = painter.paint_track(*given, *found, color, watch=watch)
+        else:
+            new = self._paint(*given, job.brush, color, job.stroke, watch=watch)
+        return jax.block_until_ready(new), box[0] if box else None
 
     def _finish(self, job: _Job, before: Canvas, after: Canvas | None, box):
         at = np.nonzero(self._owner == job.number)

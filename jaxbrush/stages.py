@@ -22,7 +22,7 @@ from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, rollout
 from jaxbrush.canvas import Canvas, from_srgb, to_srgb
 from jaxbrush.metrics import image_scale
 from jaxbrush.models import Generator, GeneratorConfig
-from jaxbrush.pairs import REACH, coated
+from jaxbrush.pairs import REACH, clock_map, coated, on_way
 from jaxbrush.patches import Box, Layout, PatchConfig, Rect
 from jaxbrush.raster import WIDTH, dilate, trajectory_maps
 from jaxbrush.structs import config, state
@@ -107,7 +107,7 @@ class Nets:
 
 @state
 class Drawn:
-    """Maps of a stroke on the grid of its box: pressure, sweeps, time (h, w, 1), trajectory
+    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm] (h, w, 1), trajectory
     (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as there, 0 off the canvas. share:
     (h, w, 1) of what is painted in what the canvas becomes: 1 where bristles came, falling to 0
     within `RIM`. whole: () as in TrajectoryMaps."""
@@ -143,8 +143,23 @@ def place_stamps(options: PainterConfig, brush: BrushParams, stroke: Stroke, sta
 
 
 def trace(options: PainterConfig, brush: BrushParams, stroke: Stroke) -> BristleTrack:
-    """Moves a loaded brush along the stamps of a stroke."""
-    return coated(rollout(options.brush, brush, stroke))
+    """Moves a loaded brush along the stamps of a stroke; the track's clock is the way [mm]."""
+    track = on_way(coated(rollout(options.brush, brush, stroke)), stroke, brush.press_depth)
+    return on_steps(options, track)
+
+
+STEPS = 2048
+"""Of a pixel, on which bristles of exact maps stand: 24 bits then hold their places on a canvas of
+4096 pixels, and on every patch of it, alike."""
+
+
+def on_steps(options: PainterConfig, track: BristleTrack) -> BristleTrack:
+    """The track with bristles on `STEPS`, so that all patches see it the same to the bit; as it is
+    for soft maps, which have slopes in the places."""
+    if options.edge is not None:
+        return track
+    step = options.pixel / STEPS
+    return dataclasses.replace(track, position=jnp.round(track.position / step) * step)
 
 
 def touches(options: PainterConfig, track: BristleTrack):
@@ -166,27 +181,6 @@ def touches(options: PainterConfig, track: BristleTrack):
     return jnp.where(sound[:, None], bounds, jnp.nan)
 
 
-def last_touch(options: PainterConfig, corner, bounds):
-    """The last stamp at which a stroke changes the maps of patches: after it they are final, but
-    for the times, which are shares of the whole stroke's duration.
-
-    Of the first stamps of a stroke it tells which patches the brush has left so far; a brush that
-    comes back touches a patch again.
-
-    Args:
-      corner: (n, 2) of the patches. bounds: (t, 4) from `touches`.
-
-    Returns:
-      (n,) int, -1 where the stroke does not come.
-    """
-    # The mask reaches beyond what is touched.
-    first = corner[:, None].astype(bounds.dtype) - float(REACH)
-    last = first + float(options.patches.size + 2 * REACH)
-    hit = (bounds[None, :, :2] < last) & (bounds[None, :, 2:] >= first)
-    stamp = jnp.arange(bounds.shape[0], dtype=jnp.int32)[None]
-    return jnp.max(jnp.where(jnp.all(hit, axis=-1), stamp, -1), axis=1)
-
-
 def faded(cover):
     """Coverage (h, w) to the share of what is painted: 1 a pixel beyond it, 0 after `RIM`; and
     coverage dilated by `RIM`."""
@@ -197,21 +191,14 @@ def faded(cover):
     return share, cover
 
 
-def draw(
-    options: PainterConfig, box: Box | Rect, shape, track: BristleTrack, color, duration=None
-) -> Drawn:
+def draw(options: PainterConfig, box: Box | Rect, shape, track: BristleTrack, color) -> Drawn:
     """Draws the maps of a stroke on its box, scaled as in training pairs.
 
     Args:
-      shape: (h, w) of the canvas. color: (3,) of the paint, linear RGB.
-      duration: of the whole stroke [s], where the track is only its beginning.
+      shape: (h, w) of the canvas. track: from `trace`. color: (3,) of the paint, linear RGB.
     """
     grid = patches.grid_of(options.patches, box, options.pixel)
     maps = trajectory_maps(grid, track, to_srgb(jnp.asarray(color, float)), edge=options.edge)
-    time = maps.time
-    if duration is not None:
-        end = jnp.max(jnp.where(track.valid, track.time, track.time[0]))
-        time = time * ((end - track.time[0]) / duration)
     at = patches.corner_of(options.patches, box)
     row, column = (at[k] + jnp.arange(grid.shape[k], dtype=jnp.int32) for k in (0, 1))
     inside = ((row >= 0) & (row < shape[0]))[:, None] & ((column >= 0) & (column < shape[1]))[None]
@@ -222,7 +209,7 @@ def draw(
     return Drawn(
         pressure=maps.pressure[..., None],
         sweeps=maps.sweeps[..., None],
-        time=time[..., None],
+        time=clock_map(maps.time, track)[..., None],
         trajectory=maps.color,
         mask=inside * dilate(grown, REACH - RIM)[..., None],
         share=inside * share[..., None],

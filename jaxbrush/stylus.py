@@ -147,6 +147,15 @@ def stamps_needed(stroke: Stroke, spacing, max_dt, depth=0.0) -> jax.Array:
     return _stamps(stroke, _progress(stroke, spacing, max_dt, depth))
 
 
+def way(stroke: Stroke, depth=0.0) -> jax.Array:
+    """How far the handle has come at each sample, (t,) [mm] from 0, as `resample` measures it.
+
+    Args:
+      stroke: t samples. depth: as for `resample`.
+    """
+    return _progress(stroke, 1.0, jnp.inf, depth)
+
+
 def resample(stroke: Stroke, count: int, spacing, max_dt, depth=0.0) -> Stroke:
     """Places stamps at equal arc length, or at equal time where the hand is slow.
 

@@ -267,6 +267,26 @@ def test_batch_norm_uses_the_batch_while_training_and_averages_after():
     np.testing.assert_allclose(settled, y, atol=1e-4)
 
 
+def test_folded_moments_are_those_of_the_pictures():
+    options = GeneratorConfig(width=SMALL)
+    one = 0.5 * drawn(2, 32, 64, 3) * jnp.linspace(0.2, 2.0, 64)[None, None, :, None]
+    variables = some_variables(Generator(options), one, scale=0.2)
+    picture = one[:1]
+    whole = Generator(options).apply(variables, picture)
+    config, plain = models.folded(options, variables, [picture, picture])
+    assert config == dataclasses.replace(options, norm="none")
+    np.testing.assert_allclose(Generator(config).apply(plain, picture), whole, atol=1e-4)
+    # Moments of a part are others: with them it is painted differently, folded the same.
+    part, seen = picture[:, :, :48], np.s_[:, :, :24]
+    assert np.abs(Generator(options).apply(variables, part)[seen] - whole[seen]).max() > 0.01
+    local = Generator(config).apply(plain, part)
+    np.testing.assert_allclose(local[seen], whole[seen], atol=1e-4)
+    with pytest.raises(ValueError, match="norm = 'none': expected 'instance'"):
+        models.folded(config, plain, [picture])
+    with pytest.raises(ValueError, match="no pictures"):
+        models.folded(options, variables, [])
+
+
 def test_masked_norm_needs_weights():
     network = Generator(GeneratorConfig(width=SMALL, norm="masked"))
     with pytest.raises(ValueError, match="weights = None"):

@@ -63,7 +63,7 @@ def line(start, end, count=9):
 def maps_of(stroke, shape=(64, 64), options=OPTIONS):
     track, bounds = painter._begin(options, BRUSH, stroke)
     box = painter.place(options, shape, bounds)
-    drawn, _ = painter._draw(options, box, shape, track, jnp.asarray(PAINT))
+    drawn, _ = painter.draw_on(options, box, shape, track, jnp.asarray(PAINT))
     return box, drawn, track, bounds
 
 
@@ -284,35 +284,6 @@ def test_slope_from_canvas_to_stylus():
     assert np.all(np.isfinite(off)) and np.median(off) < 0.1, off
 
 
-def test_a_patch_may_be_painted_when_the_brush_has_left_it():
-    """Maps are final there, but for times, which are shares of a duration not known before."""
-    stroke = line((0.5, 0.5), (7.5, 7.0), 65)
-    before, cut = canvas(), jax.jit(stages.cut)
-    box, drawn, track, bounds = maps_of(stroke)
-    count, now = 16, 27
-    layout, pair = painter._cut(OPTIONS, box, drawn, before, count=count)
-    early = dataclasses.replace(track, valid=track.valid & (jnp.arange(32) < now))
-    last = jax.jit(stages.last_touch)(OPTIONS, layout.corner, bounds)
-    seen = jax.jit(stages.touches)(OPTIONS, early)
-    assert np.all(np.asarray(seen[:now]) == np.asarray(bounds[:now]))
-    left = np.asarray(layout.present & (last < now) & (last >= 0))
-    assert 0 < left.sum() < int(layout.present.sum())
-    duration = float(jnp.max(jnp.where(track.valid, track.time, 0.0)) - track.time[0])
-    begun, _ = painter._draw(OPTIONS, box, (64, 64), early, jnp.asarray(PAINT))
-    known = jax.jit(stages.draw)(OPTIONS, box, (64, 64), early, jnp.asarray(PAINT), duration)
-    part = cut(OPTIONS, box, known, before, layout)
-    for name in pair:
-        atol = 1e-5 if name == "time" else 0.0
-        np.testing.assert_allclose(part[name][left], pair[name][left], atol=atol, err_msg=name)
-    late = painter.paint_patches(OPTIONS, NETS, pair, layout)
-    soon = painter.paint_patches(OPTIONS, NETS, part, layout)
-    np.testing.assert_allclose(soon[left], late[left], atol=0.1 / 255.0)
-    # Without the duration, times are too long, and heights alone are final.
-    hasty = painter.paint_patches(OPTIONS, NETS, cut(OPTIONS, box, begun, before, layout), layout)
-    np.testing.assert_allclose(hasty[left][..., 0], late[left][..., 0], atol=0.1 / 255.0)
-    print("color by a wrong duration:", np.abs(hasty[left] - late[left]).max())
-
-
 def test_moments_of_the_whole_stroke_leave_no_seam():
     """Without any blend, once the overlap holds what a network sees; each patch by its own moments
     leaves some."""
@@ -349,7 +320,8 @@ def test_moments_of_the_whole_stroke_leave_no_seam():
 
 @pytest.mark.parametrize("strokes", [40, pytest.param(200, marks=pytest.mark.slow)])
 def test_a_session_compiles_a_bounded_number_of_times(strokes):
-    stages_run = (painter._trace, painter._draw, painter._evaluate, painter._cut, painter._lay_over)
+    names = ("_trace", "draw_on", "_evaluate", "_cut", "_lay_over")
+    stages_run = [getattr(painter, name) for name in names]
     before = [f._cache_size() for f in stages_run]
     now, rng = canvas(), np.random.default_rng(0)
     for k in range(strokes):

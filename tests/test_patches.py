@@ -176,14 +176,17 @@ def test_rectangles_hold_their_stroke_and_its_margin():
         low, high = ends[0], ends[1] + 1
         rect = patches.rect_of(low, high, 4, canvas, buckets)
         if rect is None:
-            assert np.max(np.minimum(high + 4, canvas) - np.maximum(low - 4, 0)) > buckets[-1]
+            low = np.maximum(low - 4, 0) // 4 * 4
+            assert np.max(np.minimum(high + 4, canvas) - low) > buckets[-1]
             continue
         corner, sides = np.asarray(rect.corner), np.asarray(rect.sides)
         assert np.all(np.isin(sides, buckets))
         assert np.all(corner <= np.maximum(low - 4, 0))
         assert np.all(corner + sides >= np.minimum(high + 4, canvas))
+        assert np.all(corner % 4 == 0)
+        # Where the canvas ends between multiples of 4, so much beyond it.
         inside = sides <= canvas
-        assert np.all((corner >= 0)[inside]) and np.all((corner + sides <= canvas)[inside])
+        assert np.all((corner >= 0)[inside]) and np.all((corner + sides < canvas + 4)[inside])
 
 
 def test_patches_are_counted_from_where_the_brush_goes():

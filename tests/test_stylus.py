@@ -358,3 +358,14 @@ def test_transform_is_traced_in_every_argument():
     for i in range(2):
         alone = stylus.transform(curl(), *(x[i] for x in moves), bool(mirror[i]))
         assert_close(jax.tree.map(lambda x, i=i: x[i], batch), alone)
+
+
+def test_way_is_what_stamps_are_counted_by():
+    stroke = stylus.make_stroke(
+        [(0.0, 0.0), (3.0, 4.0), (3.0, 4.0)], [0.0, 0.1, 0.2], [0.0, 0.0, 0.5]
+    )
+    np.testing.assert_allclose(stylus.way(stroke, 2.0), [0.0, 5.0, 6.0], rtol=1e-6)
+    assert int(stylus.stamps_needed(stroke, 0.25, np.inf, 2.0)) == 25
+    stamps = stylus.resample(stroke, 32, 0.25, np.inf, 2.0)
+    expected = np.minimum(0.25 * np.arange(32), 6.0)
+    np.testing.assert_allclose(stylus.way(stamps, 2.0), expected, atol=1e-5)

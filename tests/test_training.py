@@ -148,6 +148,29 @@ def test_no_budget_is_refused(tmp_path):
         training.run(options, "height", toy(2), toy(2), tmp_path)
 
 
+def test_a_training_may_start_from_exported_weights(tmp_path):
+    """Of the same network they are taken as they are; moments are folded where norms differ."""
+    pairs = toy(8)
+    first = dataclasses.replace(SMALL, average=False, steps=2)
+    config, state, _ = training.run(first, "height", pairs, toy(2, seed=1), tmp_path / "first")
+    path = tmp_path / "height.npz"
+    checkpoint.export(path, config.generator, {"params": state.generator}, {})
+    held = toy(2, seed=1)
+    found = {}
+    for norm in ("instance", "none"):
+        options = dataclasses.replace(SMALL, start=path, norm=norm, steps=1, rate=0.0)
+        config, state, _ = training.run(options, "height", pairs, held, tmp_path / norm)
+        variables = {"params": state.average}
+        found[norm] = evaluation.paint(config.generator, variables, held.batch)
+    exported = checkpoint.load(path)
+    before = evaluation.paint(exported.config, exported.variables, held.batch)
+    np.testing.assert_allclose(found["instance"], before, atol=1e-5)
+    assert 0.0 < np.abs(found["none"] - before).mean() < 0.1 * np.abs(before).mean() + 0.02
+    other = dataclasses.replace(SMALL, start=path, width=0.06)
+    with pytest.raises(ValueError, match="is of another network: width: 0.03 saved, 0.06 given"):
+        training.run(other, "height", pairs, held, tmp_path / "other")
+
+
 @pytest.mark.slow
 def test_fit_beats_half_of_copying_the_background(tmp_path):
     options = Options(out=tmp_path, steps=500, minutes=None, width=0.25, discriminator_width=0.25,
