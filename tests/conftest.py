@@ -7,7 +7,10 @@ if WORKERS > 1:
     # Each worker's XLA would otherwise start as many compute threads as there are cores.
     os.environ.setdefault("PJRT_NPROC", str(max(1, (os.cpu_count() or 1) // WORKERS)))
 
-import jax  # noqa: E402  (the variable above is read when the backend starts)
+# What is tested is what is compiled now.
+os.environ["JAX_ENABLE_COMPILATION_CACHE"] = "0"
+
+import jax  # noqa: E402  (the variables above are read when it is imported)
 import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")

@@ -8,6 +8,9 @@ documents it, and the spelling that the house rules ask for must pass.
 
 import ast
 import functools
+import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -413,3 +416,37 @@ def test_multiply_and_reduce_up_to_rank_six(rank):
 
     expected = np.sum(x * (x + 1), axis=tuple(range(1, rank)))
     assert_right(run, expected, jnp.asarray(x), jnp.asarray(x + 1))
+
+
+KEPT = """
+import experiments, jax, zlib
+jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+from jaxbrush import BrushConfig, make_brush, random_stroke, resample, rollout
+config = BrushConfig(nodes=4)
+brush = make_brush(jax.random.key(0), config, "flat", 8)
+stroke = resample(random_stroke(jax.random.key(1)), 32, 0.25, 0.01)
+track = jax.jit(rollout)(config, brush, stroke)
+print(zlib.crc32(track.position.tobytes()), zlib.crc32(track.force.tobytes()))
+"""
+
+
+def test_kept_functions_compute_the_same_bits(tmp_path):
+    """Experiments keep what they have compiled (experiments/__init__.py)."""
+    root = str(Path(__file__).parents[1])
+    ours = {k: v for k, v in os.environ.items() if not k.startswith(("JAX_", "TF_CPP"))}
+    runs = [
+        subprocess.run(
+            [sys.executable, "-c", KEPT],
+            cwd=tmp_path,
+            env=ours | {"PYTHONPATH": root},
+            capture_output=True,
+            text=True,
+            timeout=300,
+        )  # fmt: skip
+        for _ in range(2)
+    ]
+    for run in runs:
+        assert run.returncode == 0 and run.stderr == "", run.stderr
+    assert runs[0].stdout == runs[1].stdout
+    (kept,) = (tmp_path / "results" / ".compiled").iterdir()
+    assert sum(path.name.endswith("-cache") for path in kept.iterdir()) > 5

@@ -188,6 +188,21 @@ def test_canvases_of_any_size():
     check_painted(found, tiny, stroke)
 
 
+@pytest.mark.slow
+def test_the_largest_canvas():
+    """4096 pixels a side, a stroke in the middle and one off its last corner; the rest is left."""
+    options = dataclasses.replace(OPTIONS, moments="stroke", blend="cut", sides=(64,))
+    before, side = canvas(4096, 4096), 4096 * options.pixel
+    for x, y in ((0.5 * side, 0.5 * side), (side - 2.0, side - 1.0)):
+        stroke = line((x, y), (x + 3.0, y + 2.0))
+        after = painter.paint_stroke(options, NETS, before, BRUSH, PAINT, stroke)
+        changed = np.any(np.asarray(after.color != before.color), axis=-1)
+        rows, columns = np.nonzero(changed)
+        assert changed.sum() > 100 and np.all(np.isfinite(np.asarray(after.color)))
+        at = np.asarray([columns, rows]) * options.pixel - np.asarray([[x], [y]])
+        assert at.min() > -2.0 and at[0].max() < 5.0 and at[1].max() < 4.0
+
+
 def test_networks_see_what_they_were_trained_on():
     """One patch by hand, from the dictionary that a data set gives."""
     box, drawn, *_ = maps_of(line(*PATHS["inside"]))
