@@ -71,7 +71,7 @@ def test_what_is_missing_is_named_before_work_begins(tmp_path):
 @pytest.mark.parametrize("engine", ["neural", "realtime"])
 def test_a_recording_is_painted(engine, tmp_path):
     weights = []
-    for kind, outputs, channels in (("height", 1, 2), ("color", 3, 8)):
+    for kind, outputs, channels in (("height", 1, 3), ("color", 3, 8)):
         options = GeneratorConfig(outputs, width=0.05)
         variables = Generator(options).init(jax.random.key(0), jnp.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
