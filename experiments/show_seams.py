@@ -1,6 +1,7 @@
 """Seams between patches, with every way to avoid them (paper Figure 9): pictures, size, time.
 
 python -m experiments.show_seams
+python -m experiments.show_seams --instance HEIGHT.npz COLOR.npz    # beside networks with moments
 """
 
 import dataclasses
@@ -26,6 +27,7 @@ NAMES = {
     ("patch", "cut"): "side by side", ("patch", "feather"): "linear feather",
     ("patch", "poisson"): "Poisson blend", ("stroke", "cut"): "one stroke's moments",
 }  # fmt: skip
+LOCAL = "networks without moments"
 BAR = 1.0 / 255.0
 SHAPE = (192, 320)
 
@@ -35,7 +37,9 @@ class Config:
     """Paints the same strokes with every blend."""
 
     weights: tuple[Path, Path] = engines.SHIPPED
-    """Height and color network."""
+    """Height and color network, painted side by side."""
+    instance: tuple[Path, Path] | None = None
+    """Two with instance normalisation, as the paper's, painted with every blend."""
     out: Path | None = None
     """Folder for picture and numbers [default: results/show_seams]."""
     quick: bool = False
@@ -73,41 +77,54 @@ def seam_of(options: stages.PainterConfig, watched: dict, before, box) -> np.nda
 _seam = jax.jit(seams.seam)
 
 
+def paint_all(how: painter.PainterConfig, nets: painter.Nets, strokes):
+    """(canvas, seams where there are any [image scale], milliseconds of each stroke)."""
+    found, took = [np.zeros(1)], []
+    for timed in (False, True):
+        canvas = blank(SHAPE)
+        for deed in strokes:
+            watched = {}
+            start = time.perf_counter()
+            after = painter.paint_stroke(
+                how, nets, canvas, deed.brush, np.asarray(deed.color, np.float32), deed.stroke,
+                watch=lambda stage, value, to=watched: to.update({stage: value}),
+            )  # fmt: skip
+            jax.block_until_ready(after)
+            if timed:
+                took.append(1e3 * (time.perf_counter() - start))
+            else:
+                box = painter.place(how, SHAPE, watched["brush"][1])
+                found.append(seam_of(how, watched, canvas, box))
+            canvas = after
+    return canvas, np.concatenate(found), took
+
+
 def main(options: Config) -> None:
     try:
-        nets = painter.load_nets(*options.weights)
+        jobs = {LOCAL: (painter.load_nets(*options.weights), ("stroke", "cut"))}
+        if options.instance:
+            others = painter.load_nets(*options.instance)
+            jobs = {NAMES[way]: (others, way) for way in WAYS} | jobs
     except (ValueError, OSError) as error:
         raise SystemExit(f"{error}") from error
     folder = results_folder("show_seams", options.out)
     strokes = deeds()[: 1 if options.quick else None]
     results, pictures = {}, {}
-    for moments, blend in track(WAYS, "blends", console=console):
+    for name, (nets, (moments, blend)) in track(jobs.items(), "blends", console=console):
         how = painter.PainterConfig(moments=moments, blend=blend, sides=())
-        found, took = [np.zeros(1)], []
-        for timed in (False, True):
-            canvas = blank(SHAPE)
-            for deed in strokes:
-                watched = {}
-                start = time.perf_counter()
-                after = painter.paint_stroke(
-                    how, nets, canvas, deed.brush, np.asarray(deed.color, np.float32), deed.stroke,
-                    watch=lambda stage, value, to=watched: to.update({stage: value}),
-                )  # fmt: skip
-                jax.block_until_ready(after)
-                if timed:
-                    took.append(1e3 * (time.perf_counter() - start))
-                else:
-                    box = painter.place(how, SHAPE, watched["brush"][1])
-                    found.append(seam_of(how, watched, canvas, box))
-                canvas = after
-        every = np.concatenate(found)
-        results[NAMES[moments, blend]] = {
+        canvas, every, took = paint_all(how, nets, strokes)
+        results[name] = {
             "largest": float(every.max()), "p99": float(np.percentile(every, 99.0)),
             "milliseconds": float(np.median(took)),
         }  # fmt: skip
-        pictures[NAMES[moments, blend]] = paint_session.lit(canvas)
-    figure, axes = plt.subplots(2, 2, figsize=(13.0, 8.6), layout="constrained")
-    for axis, (name, picture) in zip(axes.ravel(), pictures.items(), strict=True):
+        pictures[name] = paint_session.lit(canvas)
+    rows = -(-len(pictures) // 2)
+    figure, axes = plt.subplots(
+        rows, 2, figsize=(13.0, 4.3 * rows), layout="constrained", squeeze=False
+    )
+    for axis in axes.ravel()[len(pictures) :]:
+        axis.set_axis_off()
+    for axis, (name, picture) in zip(axes.ravel(), pictures.items(), strict=False):
         row = results[name]
         axis.imshow(picture)
         axis.set(xticks=[], yticks=[])
