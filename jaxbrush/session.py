@@ -10,7 +10,6 @@ import queue
 import threading
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush import painter
@@ -22,6 +21,7 @@ from jaxbrush.patches import Box
 from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.recordings import BrushEvent, ColorEvent, StrokeEvent
 from jaxbrush.recordings import Session as Recording
+from jaxbrush.screen import Screen, part_of, with_part
 from jaxbrush.stream import Stream, local
 from jaxbrush.stylus import Stroke
 
@@ -82,9 +82,7 @@ class Session:
     ):  # fmt: skip
         self.options, self._nets, self._paint = options, nets, paint
         self._canvas = canvas
-        self._shown = Canvas(np.array(canvas.height), np.array(canvas.color))
-        # Number of the latest stroke whose preview is over a pixel.
-        self._owner = np.zeros(canvas.height.shape, np.int32)
+        self._shape, self._screen = canvas.height.shape, Screen(canvas)
         self._lock = threading.Lock()
         self._idle = threading.Condition(self._lock)
         self._queue = queue.SimpleQueue()
@@ -113,7 +111,7 @@ class Session:
     @property
     def shown(self) -> Canvas:
         """The picture with previews of what is not finished; a copy, as numpy arrays."""
-        return jax.tree.map(np.copy, self._shown)
+        return jax.tree.map(np.copy, self._screen.canvas)
 
     def begin(self, brush: BrushParams, color, event: dict | None = None) -> int:
         """Sets the brush down for a stroke.
@@ -170,7 +168,7 @@ class Session:
         self._queue.put((job, (track, bounds)))
         job.bounds.append(np.asarray(bounds))
         if not job.long:
-            box = painter.place(self.options, self._owner.shape, np.concatenate(job.bounds))
+            box = painter.place(self.options, self._shape, np.concatenate(job.bounds))
             job.long = isinstance(box, Box)
         if job.long:
             self._lifted.set()
@@ -200,7 +198,7 @@ class Session:
         with self._lock:
             news, self._news = self._news, []
         for patch in news:
-            self._show(patch.corner, patch.canvas, patch.stroke, patch.final)
+            self._screen.show(patch.corner, patch.canvas, patch.stroke, patch.final)
         return news
 
     def wait(self, timeout: float | None = None) -> bool:
@@ -235,14 +233,14 @@ class Session:
             if finished:
                 self._history.pop()
                 if job.box is not None:
-                    self._canvas = _with(self._canvas, job.box, job.before)
+                    self._canvas = with_part(self._canvas, job.box, job.before)
             else:
                 job.cancelled = True
                 self._waiting.remove(job)
                 self._idle.notify_all()
         if finished and job.box is not None:
             corner = tuple(s.start for s in job.box)
-            self._show(corner, job.before, job.number)
+            self._screen.show(corner, job.before, job.number)
             return Patch(job.number, corner, job.before, True)
         return self._uncover(job.number)
 
@@ -277,49 +275,16 @@ class Session:
 
     def _preview(self, track, bounds) -> Patch | None:
         job = self._open
-        shape = self._owner.shape
-        box = painter.place_piece(self.options, shape, bounds)
+        box = painter.place_piece(self.options, self._shape, bounds)
         if box is None:
             return None
         cover, corner = painter.covered(self.options, box, track)
-        cover = np.asarray(cover)
-        low = np.maximum(corner, 0)
-        high = np.minimum(np.asarray(corner) + cover.shape, shape)
-        cover = cover[
-            tuple(slice(*x) for x in np.stack([low, high], 1) - np.asarray(corner)[:, None])
-        ]
-        if not cover.any():
-            return None
-        at = tuple(slice(*x) for x in np.stack([low, high], 1))
-        height, color = self._shown.height[at], self._shown.color[at]
-        height[cover] = np.maximum(height[cover], PREVIEW_FILM)
-        color[cover] = job.color
-        self._owner[at][cover] = job.number
-        part = Canvas(height.copy(), color.copy())
-        return Patch(job.number, tuple(int(x) for x in low), part, False)
-
-    def _show(self, corner, part: Canvas, number: int, final: bool = True):
-        """Puts a part where no later preview is; what is not final can be taken away again."""
-        h, w = part.height.shape
-        at = (slice(corner[0], corner[0] + h), slice(corner[1], corner[1] + w))
-        take = self._owner[at] <= number
-        self._shown.height[at][take] = part.height[take]
-        self._shown.color[at][take] = part.color[take]
-        self._owner[at][take] = 0 if final else number
+        found = self._screen.cover(job.number, np.asarray(cover), corner, PREVIEW_FILM, job.color)
+        return Patch(job.number, *found, False) if found else None
 
     def _uncover(self, number: int) -> Patch | None:
-        """Takes the preview of a stroke away."""
-        rows, columns = np.nonzero(self._owner == number)
-        if not rows.size:
-            return None
-        at = (slice(rows.min(), rows.max() + 1), slice(columns.min(), columns.max() + 1))
-        part = _part(self._canvas, at)
-        take = self._owner[at] == number
-        self._shown.height[at][take] = part.height[take]
-        self._shown.color[at][take] = part.color[take]
-        self._owner[at][take] = 0
-        corner = (int(at[0].start), int(at[1].start))
-        return Patch(number, corner, jax.tree.map(lambda x: x[at].copy(), self._shown), False)
+        found = self._screen.uncover(number, self._canvas)
+        return Patch(number, *found, False) if found else None
 
     def _work(self):
         while (item := self._queue.get()) is not None:
@@ -368,13 +333,13 @@ class Session:
             raise job.error
         stream = job.stream if job.stream is not None and job.stream.fits else None
         if job.long and stream is not None:
-            box = painter.reached(self._owner.shape, stream.bounds)
+            box = painter.reached(self._shape, stream.bounds)
             return stream.result(self._lifted.wait), box
         box = []
 
         def watch(stage, value):
             if stage == "brush":
-                box.append(painter.reached(self._owner.shape, value[1]))
+                box.append(painter.reached(self._shape, value[1]))
             jax.block_until_ready(value)
             self._lifted.wait()
 
@@ -389,38 +354,18 @@ class Session:
         return jax.block_until_ready(new), box[0] if box else None
 
     def _finish(self, job: _Job, before: Canvas, after: Canvas | None, box):
-        at = np.nonzero(self._owner == job.number)
-        if at[0].size:
-            # All of its preview goes, wherever that was.
-            shown = [(int(x.min()), int(x.max()) + 1) for x in at]
-            if box is not None:
-                ends = zip(shown, ((s.start, s.stop) for s in box), strict=True)
-                shown = [(min(a[0], b[0]), max(a[1], b[1])) for a, b in ends]
-            box = tuple(slice(*x) for x in shown)
-            if after is None:
-                # What was shown stays, so that no stroke is lost.
-                part, mine = _part(before, box), self._owner[box] == job.number
-                part.height[mine] = self._shown.height[box][mine]
-                part.color[mine] = self._shown.color[box][mine]
-                after = _with(before, box, part)
+        # All of its preview goes, wherever that was.
+        box = self._screen.extent(job.number, box)
+        if after is None and box is not None:
+            # What was shown stays, so that no stroke is lost.
+            part, mine = part_of(before, box), self._screen.owner[box] == job.number
+            part.height[mine] = self._screen.canvas.height[box][mine]
+            part.color[mine] = self._screen.canvas.color[box][mine]
+            after = with_part(before, box, part)
         self._history.append(job)
         if after is None or box is None:
             return
-        job.box, job.before = box, _part(before, box)
+        job.box, job.before = box, part_of(before, box)
         self._canvas = after
         corner = tuple(s.start for s in box)
-        self._news.append(Patch(job.number, corner, _part(after, box), True, job.error))
-
-
-def _part(canvas: Canvas, at) -> Canvas:
-    # Cut on the host: a slice on the device would compile for every new size.
-    return jax.tree.map(lambda x: np.asarray(x)[at].copy(), canvas)
-
-
-def _with(canvas: Canvas, at, part: Canvas) -> Canvas:
-    def put(x, new):
-        x = np.array(x)
-        x[at] = new
-        return jnp.asarray(x)
-
-    return jax.tree.map(put, canvas, part)
+        self._news.append(Patch(job.number, corner, part_of(after, box), True, job.error))
