@@ -78,6 +78,11 @@ def test_batches_are_in_network_scale(folder):
     alone = [data.height_batch(p, hand) for hand in ("pressure", "sweeps")]
     np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
     np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
+    # The clock is the way of the brush: some millimetres.
+    assert 1.0 < p["time"].max() < 10.0
+    scaled = np.asarray(data.network_time(jnp.asarray([0.0, 1.0, 2.0, 4.0, 64.0, 100.0])))
+    assert scaled[0] == -1.0 and scaled[4] == scaled[5] == 1.0 and np.all(np.diff(scaled[:5]) > 0.0)
+    np.testing.assert_array_equal(color.inputs[..., 6], data.network_time(p["time"])[..., 0])
     with pytest.raises(ValueError, match="hand = 'left'"):
         data.height_batch(p, "left")
     for batch in (height, color, *alone):
