@@ -173,13 +173,14 @@ def report(rows, pixel: float, title: str):
     """Prints the table of all strokes."""
     print_table(
         title,
-        ["stroke", "start [mm]", "opened", "end [mm]", "end [pixels]", "largest [mm]",
+        ["stroke", "start [mm]", "opened", "first", "end [mm]", "end [pixels]", "largest [mm]",
          "firm [mm]", "pressure from", "to, rms", "seconds", "gaps"],
         [
             [
                 r["stroke"],
                 f"{r['start']['path']:.2f}",
                 f"{r['opened']['path']:.2f}",
+                f"{r['first']['path']:.4f}",
                 f"{r['end']['path']:.4f}",
                 f"{r['end']['path'] / pixel:.2f}",
                 f"{r['end']['most']:.3f}",

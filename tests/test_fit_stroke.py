@@ -87,13 +87,25 @@ def test_loss_has_a_finite_slope_and_is_least_at_the_truth(case, tools):
 @pytest.mark.slow
 def test_small_fit_comes_closer_with_finite_slopes(case, tools):
     losses = []
-    found = f.fit(SMALL, tools, FEW, case, lambda stroke, loss, whole: losses.append(loss))
+    watch = lambda stroke, loss, whole: losses.append(loss)  # noqa: E731
+    found = f.fit(SMALL, tools, FEW, case, watch, again=0)
     losses = np.asarray(losses[f.OPENING :], float)
     before, after = f.errors(_stroke(case, case.start), case), f.errors(found, case)
     assert np.isfinite(losses).all()
     assert losses[-1] < losses[0]
     assert after["path"] < before["path"] / 8.0
     assert after["press"] < before["press"] / 2.0
+    # A second descent, from near by, is kept only where its maps are more alike.
+    target = target_of(FEW[-1], case.exact)
+    unlike = lambda x: float(  # noqa: E731
+        f.unlike_exact(f.exact_maps(case.origin, tools.draw(x, case.brush)), target)
+    )
+    ticks = []
+    other = f.fit(SMALL, tools, FEW, case, again=1, tick=lambda: ticks.append(1))
+    assert len(ticks) == sum(level.steps for level in FEW) and unlike(other) <= unlike(found)
+    off = f.disturbed(np.random.default_rng(0), found, early=True)[:, :2] - found.position
+    size = np.linalg.norm(off, axis=1)
+    assert size[:10].mean() > 0.05 and size[-10:].max() < 0.01
 
     unknown = f.unknown_of(case.start, SMALL.scales)
     drawn = tools.draw(f.stroke_of(unknown, case.true), case.brush)
