@@ -72,12 +72,12 @@ def makers(options: Config, shape, deeds) -> dict:
         nets = painter.load_nets(*options.fast)
         found["neural, fast"] = lambda: engines.Neural(painter.PainterConfig(), nets, shape)
     if not options.quick:
-        config, _, spacing = presets.realtime()
+        (config, _, spacing), many = presets.realtime(), presets.REAL // 2
         for label, change, apart, bristles in (
-            ("stamps 2 x apart", {}, 2.0 * spacing, presets.REAL // 4),
-            ("stamps 2 x closer", {}, 0.5 * spacing, presets.REAL // 4),
-            ("fewer rounds", {"viscous": 1, "pressure": 2}, spacing, presets.REAL // 4),
-            ("128 bristles", {}, spacing, 128),
+            ("stamps 2 x apart", {}, 2.0 * spacing, many),
+            ("stamps 2 x closer", {}, 0.5 * spacing, many),
+            ("fewer rounds", {"viscous": 1, "pressure": 2}, spacing, many),
+            ("half the bristles", {}, spacing, many // 2),
         ):
             setting = dataclasses.replace(config, **change)
             found[f"realtime, {label}"] = lambda s=setting, a=apart, b=bristles: engines.Simulator(

@@ -298,4 +298,4 @@ def make(name: str, shape, deeds: list[Deed], weights=SHIPPED):
     if name == "offline":
         return Simulator(TAUGHT, PIXEL, shape, palette_of(deeds), None)
     config, _, spacing = presets.realtime()
-    return Simulator(config, spacing, shape, palette_of(deeds), presets.REAL // 4)
+    return Simulator(config, spacing, shape, palette_of(deeds), presets.REAL // 2)

@@ -2,10 +2,11 @@
 
 A flat brush crosses a wet band of another color. Every setting sees the same bristles and is
 compared with the preset `reference`: thickness and color where the stroke changed the canvas. Beads
-at the period of the stamps (the offline paper's Figure 1b) are looked for in the spectrum along
-the stroke. The pressure of one stamp is also solved by scipy and, where installed, pyamg.
+at the period of the stamps (the paper's Figure 1b) are looked for in the spectrum along the stroke.
+A map shows where the simulator holds. The pressure of one stamp is also solved by scipy and, where
+installed, pyamg.
 
-    python -m experiments.paint_accuracy            # about 8 minutes, most of it compilation
+    python -m experiments.paint_accuracy            # about 10 minutes, most of it compilation
     python -m experiments.paint_accuracy --quick    # about 2 minutes
 """
 
@@ -39,6 +40,7 @@ from experiments.paint_cases import (
     track_of,
 )
 from experiments.paint_pressure import compare_solvers, system_of
+from experiments.paint_stability import chart_stability, stability
 from jaxbrush.paint import load_brush, presets
 
 FAMILIES = {
@@ -75,7 +77,7 @@ def settings(options: Config) -> list[Setting]:
     """Presets first, then one change at a time of `offline` with stamps a pixel apart."""
     found = []
     for name in ("offline", "realtime"):
-        bristles = BRISTLES if name == "offline" else BRISTLES // 4
+        bristles = BRISTLES if name == "offline" else BRISTLES // 2
         config, _, spacing = getattr(presets, name)(bristles)
         config = dataclasses.replace(config, pigments=2)
         found.append(Setting(name, "", name, config, spacing, bristles))
@@ -262,7 +264,9 @@ def main(options: Config) -> None:
                 calls[s.name] = call
         took = clock(calls, options.rounds, progress)
         solved = pressures(every[0], options)
-    true, points = results["reference"], []
+        true, points = results["reference"], []
+        seen = VISIBLE, TALL
+        held = stability(every[0].config, true, options.length, options.quick, seen, progress)
     for s in every:
         r, seconds = results[s.name], took[s.name]
         # A period of two pixels is the shortest that they show.
@@ -275,9 +279,10 @@ def main(options: Config) -> None:
              "spacing": s.spacing, "bristles": s.bristles, "config": s.config}
         )  # fmt: skip
     chart(points, results, options, folder / "accuracy.png")
+    chart_stability(held, true, folder / "stability.png")
     film = float(true.height[touched(true)].mean())
     common.write_run(folder, options, {
-        "points": points, "reference": {"laid": true.laid, "mean_film_mm": film,
+        "points": points, "stability": held, "reference": {"laid": true.laid, "mean_film_mm": film,
         "residual": true.residual, "stamps": true.stamps}, "pressure": solved,
         "measured_on": machine(),
     })  # fmt: skip

@@ -123,10 +123,18 @@ class Result:
         return self.amounts.sum(0)
 
 
-def lay(setting: Setting, length: float):
-    """Paints the stroke: (Result, a call that paints it again)."""
+def padded(track: BristleTrack, stamps: int) -> BristleTrack:
+    """A track with stamps that do not count at its end, `stamps` in all."""
+    more = stamps - track.time.shape[0]
+    track = jax.tree.map(lambda a: jnp.concatenate([a, jnp.repeat(a[-1:], more, axis=0)]), track)
+    return dataclasses.replace(track, valid=track.valid & (np.arange(stamps) < stamps - more))
+
+
+def lay(setting: Setting, length: float, stamps: int = 0):
+    """Paints the stroke, padded to so many stamps: (Result, a call that paints it again)."""
     config, params = setting.config, presets.params_of(setting.bristles)
     track = thinned(track_of(length), setting.spacing, setting.bristles)
+    track = padded(track, max(stamps, track.time.shape[0]))
     canvas = canvas_of(config)
     brush = load_brush(config, params, setting.bristles, 0.8, jnp.asarray([1.0, 0.0]))
     call = lambda: paint(config, params, canvas, brush, track)  # noqa: E731

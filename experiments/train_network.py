@@ -11,7 +11,7 @@ import numpy as np
 from experiments import evaluation, make_dataset, training
 from experiments.common import console
 from experiments.evaluation import Pairs, Scale
-from jaxbrush import data, stages
+from jaxbrush import checkpoint, data, stages
 
 HELD = 2
 """Canvases of the training split, at most, that choose the best checkpoint and are not learned
@@ -33,19 +33,24 @@ class Config(training.Options):
     """Color: with the time map (paper Figure 4)."""
     height: bool = True
     """Color: with the new height (paper Figure 5)."""
+    laid: Path | None = None
+    """Color: exported height network. Every pair then comes twice, with the true new height and
+    with this network's, which is what the color network is given in use."""
 
 
 @dataclasses.dataclass(frozen=True)
 class Stored:
-    """Pairs that stay on disk until they are taken; what `training.run` learns from."""
+    """Pairs that stay on disk until they are taken; what `training.run` learns from. laid: new
+    heights (n, h, w, 1) [mm] of the same pairs, which come again with them."""
 
     found: data.Dataset
     index: np.ndarray
     kind: str
     options: Config
+    laid: np.ndarray | None = None
 
     def __len__(self):
-        return len(self.index)
+        return len(self.index) * (1 if self.laid is None else 2)
 
     @property
     def nbytes(self) -> int:
@@ -53,7 +58,11 @@ class Stored:
         return len(self) * sum(x.nbytes for x in jax.tree.leaves(one))
 
     def take(self, index):
-        raw = self.found.take("train", self.index[index])
+        which = np.asarray(index) % len(self.index)
+        raw = self.found.take("train", self.index[which])
+        if self.laid is not None:
+            again = (np.asarray(index) >= len(self.index))[:, None, None, None]
+            raw["new_height"] = np.where(again, self.laid[which], raw["new_height"])
         return jax.device_get(batch_of(raw, self.kind, self.options))
 
 
@@ -87,15 +96,32 @@ def predicted_heights(found: data.Dataset, split: str, index, exported) -> np.nd
     return (raw["height"] + share * (laid - raw["height"])).astype(np.float32)
 
 
+def _laying(kind: str, options: Config):
+    """The height network that the color network learns to follow, or None."""
+    if options.laid is None:
+        return None
+    if kind != "color" or not options.height:
+        raise ValueError("--laid: expected with train_color, and with --height, only")
+    if not options.laid.exists():
+        raise ValueError(f"--laid {options.laid}: no such file")
+    exported = checkpoint.load(options.laid)
+    if exported.config.outputs != 1:
+        raise ValueError(f"--laid {options.laid}: expected a height network, of 1 output channel")
+    return exported
+
+
 def main(kind: str, options: Config) -> None:
     try:
+        laying = _laying(kind, options)
         folder = make_dataset.build(options.preset, options.data)
         found = data.load(folder)
-    except data.DataError as error:
+    except ValueError as error:
         raise SystemExit(f"{error}") from error
     strokes = found.options.pairs.strokes
     held = strokes * min(HELD, max(1, found.options.train // 10))
     numbers = np.arange(found.count("train"))
+    known = numbers[:-held]
+    laid = None if laying is None else predicted_heights(found, "train", known, laying)
     take = lambda split, index: pairs_of(found, split, index, kind, options)  # noqa: E731
     size, tests = found.options.pairs.size, found.count("test")
     about = (
@@ -106,7 +132,7 @@ def main(kind: str, options: Config) -> None:
         training.fit(
             options,
             kind,
-            Stored(found, numbers[:-held], kind, options),
+            Stored(found, known, kind, options, laid),
             take("train", numbers[-held:]),
             take("test", np.arange(tests)),
             scale,

@@ -112,17 +112,29 @@ def test_a_stroke_gets_nearer_to_the_finest_as_layers_get_thinner():
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="a bristle is as wide as a pixel: from 0.25 to 0.125 mm 28 um rms, on to 0.0625 mm 54",
-)
+def test_a_stroke_converges_as_stamps_get_closer():
+    found = [next(films({}, step=0.24 / 2**n)) for n in range(6)]
+    error = errors("stamps", found, SIDE)
+    assert error[1] < error[0] and np.all(error[2:] < 0.6 * error[1:-1])
+
+
+CONVERGED = {"viscous": 60, "spectrum": 0.99, "solver": "zline_pcg", "pressure": 40}
+
+
+@pytest.mark.slow
 def test_a_stroke_converges_as_pixels_get_smaller():
-    # Steps between columns that stand are counted per column: a fifth of it. The rest comes with
-    # bristles that are resolved one by one. What is laid changes by 5 %.
-    found = list(films(*({"pixel": 3.0 / n, "window": n} for n in (12, 24, 48)), step=0.03))
-    error = errors("pixels", found, SIDE // 2)
-    # At least as good as first order.
-    assert error[1] < 0.6 * error[0]
+    # A bristle with its coat is as wide as a pixel of 0.125 mm; finer pixels have to spread it, or
+    # they resolve hairs one by one. Stamps are a quarter of the finest pixel apart, and rounds as
+    # many as solve the finest.
+    def films_of(across):
+        grids = ((24, 1), (48, 2), (96, 4)) if across else ((24, 1), (48, 1), (96, 1))
+        return list(films(*({"pixel": 3.0 / n, "window": n, "across": a} | CONVERGED
+                            for n, a in grids), step=0.0075))  # fmt: skip
+
+    spread, thin = (errors(name, films_of(a), SIDE) for name, a in (("spread", 1), ("thin", 0)))
+    assert spread[1] < 0.7 * spread[0] and spread[0] < 40.0
+    # The naive way is off by more, and by no less on the finer grid of the two.
+    assert thin[1] > 2.0 * spread[1]
 
 
 @pytest.mark.slow

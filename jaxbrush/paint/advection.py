@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbrush.paint.state import PaintConfig, PaintParams
+from jaxbrush.paint.state import PaintConfig, PaintParams, relaxation
 from jaxbrush.paint.stencil import inner_x, inner_y, near, wide
 
 TINY = 1e-9
@@ -161,8 +161,8 @@ def slump(config: PaintConfig, params: PaintParams, paint, hairy, step):
 
     start = (jnp.zeros_like(paint[0, 0]), jnp.zeros_like(paint[0]))
     (height, column), loose = jax.lax.scan(down, start, paint, reverse=True)
-    rate = 0.25 * (1.0 - jnp.exp(-4.0 * params.relax * step))
-    stands = params.relax_slope / config.layer
+    rate, stands = relaxation(config, params, step)
+    stands = stands / config.layer
     high, close = flat(height), flat(hairy)
     fluxes, out = [], 0.0
     for shift, inner in ((1, inner_x(width, width)), (width, inner_y(width, width))):

@@ -13,17 +13,28 @@ class Hair:
     """Points on the lowest part of the bristles in one stamp, s of each of b bristles.
 
     place: (3, s, b) x, y, z [mm]. motion: (3, s, b) displacement over the stamp [mm]. weight:
-    (s, b) how much a point touches, 1 at the tip. travel: (b,) that the tip's contact counts as
-    [mm]. volume: (s, b) [mm^3].
+    (s, b) how much a point touches, 1 at the tip. share: (s, 1) of the bristle's contact. travel:
+    (b,) that the tip's contact counts as [mm]. volume: (s, b) [mm^3].
     step: () travel of the brush [mm].
     """
 
     place: jax.Array
     motion: jax.Array
     weight: jax.Array
+    share: jax.Array
     travel: jax.Array
     volume: jax.Array
     step: jax.Array
+
+
+def _width(config: PaintConfig):
+    """Offsets (2, m) [pixels] and weights (m,), together 1, of points across a hair that is wider
+    than a pixel: a tent of that width is the sum of these tents of a pixel's."""
+    n = config.across
+    line = np.arange(1 - n, n)
+    tent = (n - np.abs(line)) / n**2
+    offset = np.stack(np.meshgrid(line, line)).reshape(2, -1)
+    return offset, np.outer(tent, tent).reshape(-1)
 
 
 def hair(config: PaintConfig, params: PaintParams, before, now, dt, count_share) -> Hair:
@@ -46,22 +57,27 @@ def hair(config: PaintConfig, params: PaintParams, before, now, dt, count_share)
     a, b = points(before), points(now)
     motion = b - a
     place = a[:, None] + motion[:, None] * along[None, :, None, None]
+    offset, part = _width(config)
+    beside = jnp.asarray(np.pad(config.pixel * offset, ((0, 1), (0, 0))), now.dtype)
+    place = place.reshape(3, 1, -1, now.shape[-1]) + beside[:, :, None, None]
     place = place.reshape(3, -1, now.shape[-1])
-    motion = jnp.tile(motion, (1, config.sweeps, 1))
+    motion = jnp.tile(motion, (1, config.sweeps * len(part), 1))
     moved = now[1] - before[1]
     distance = jnp.sqrt(jnp.sum(moved * moved, axis=0) + 1e-12)
-    weight = jnp.tile(1.0 - 0.7 * share, config.sweeps)
-    points_each = config.samples * config.sweeps
+    weight = jnp.tile(1.0 - 0.7 * share, config.sweeps * len(part))
+    each = config.samples * config.sweeps
+    part = jnp.asarray(np.repeat(part / each, each), now.dtype)[:, None]
     # The hair tapers to half its cross-section at the tip.
-    taper = jnp.tile(0.5 + 0.5 * share, config.sweeps)
-    volume = jnp.pi * params.hair_radius**2 * params.hair_length / points_each
+    taper = jnp.tile(0.5 + 0.5 * share, config.sweeps * offset.shape[1])
+    volume = jnp.pi * params.hair_radius**2 * params.hair_length
     mean = jnp.mean(now[1] - before[1], axis=1)
     return Hair(
         place=place,
         motion=motion,
         weight=weight[:, None] * count_share[None],
+        share=part,
         travel=distance + params.soak * dt,
-        volume=volume * taper[:, None] * count_share[None],
+        volume=volume * part * taper[:, None] * count_share[None],
         step=jnp.sqrt(jnp.sum(mean[:2] ** 2) + 1e-12),
     )
 

@@ -20,7 +20,7 @@ from jaxbrush.paint.advection import advect, repack
 from jaxbrush.paint.hair import Hair, corners
 from jaxbrush.paint.rollout import paint_stroke
 from jaxbrush.paint.solvers import Matrix, residual, solve
-from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams
+from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams, relaxation
 from jaxbrush.paint.stencil import inner_x, inner_y, near, stored, wide
 from jaxbrush.paint.transfer import refill, ride, transfer
 from jaxbrush.paint.velocity import stop
@@ -153,11 +153,11 @@ def fall(config: PaintConfig, params: PaintParams, top, surface, hairy, step):
     """
     size = config.window
     high, film, close = (wide(a[None], size) for a in (surface, top, hairy))
-    rate = 0.25 * (1.0 - jnp.exp(-4.0 * params.relax * step))
+    rate, stands = relaxation(config, params, step)
     faces = []
     for shift, inner in ((1, inner_x(size, size)), (size, inner_y(size, size))):
         drop = near(high, size) - near(high, size, shift)
-        beyond = jnp.maximum(jnp.abs(drop) - params.relax_slope, 0.0)
+        beyond = jnp.maximum(jnp.abs(drop) - stands, 0.0)
         beyond = beyond * jnp.asarray(inner, top.dtype)[None]
         beyond = beyond * jnp.maximum(near(close, size), near(close, size, shift))
         giver = jnp.where(drop > 0.0, near(film, size), near(film, size, shift))

@@ -48,7 +48,7 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     shape = (paint.shape[0], *paint.shape[2:])
     points = hair.weight.shape[0]
     capacity = params.tip_volume / bristles
-    area = params.contact_area / (bristles * points)
+    area = params.contact_area / bristles * hair.share
     radius = params.hair_radius
     held = jnp.sum(brush.tip, axis=0)
     load = held / capacity
@@ -69,7 +69,7 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
         * jnp.clip(2.0 * load, 0.0, 1.0)[None]
         * jnp.clip(1.0 - params.cling * rising, 0.0, 1.0)
     )
-    spare = jnp.maximum(held - 0.7 * capacity, 0.0)[None] / points
+    spare = jnp.maximum(held - 0.7 * capacity, 0.0)[None] * hair.share
     give = give + rate(params.squeeze) * touch * spare
     lift = rate(params.pickup) * touch * jnp.clip(film - even, 0.0, 3.0 * radius) * area
     lift = lift * jnp.clip(2.0 - load, 0.0, 1.0)[None]
