@@ -233,3 +233,31 @@ def test_predicted_heights_are_laid_as_in_use(folder):
     # Where bristles came it is the network's, far from them the canvas as it was.
     assert np.abs(heights - raw["new_height"])[cover].max() > 0.1
     np.testing.assert_array_equal(heights[raw["mask"] == 0.0], raw["height"][raw["mask"] == 0.0])
+
+
+def test_color_is_taught_on_true_and_on_predicted_heights(folder):
+    found = data.load(folder)
+    options = train_network.Config()
+    index = np.arange(1, found.count("train"))
+    laid = np.random.default_rng(0).uniform(0.0, 1.0, (len(index), 48, 48, 1)).astype(np.float32)
+    both = train_network.Stored(found, index, "color", options, laid)
+    once = train_network.Stored(found, index, "color", options)
+    assert len(both) == 2 * len(once) == 2 * len(index)
+    first, again = both.take([1]), both.take([1 + len(index)])
+    np.testing.assert_array_equal(first.inputs, once.take([1]).inputs)
+    np.testing.assert_array_equal(again.inputs[..., :-1], first.inputs[..., :-1])
+    np.testing.assert_array_equal(again.target, first.target)
+    np.testing.assert_allclose(again.inputs[..., -1:], data.network_height(laid[1:2]), atol=1e-6)
+
+
+def test_heights_to_follow_are_checked_before_work_starts(tmp_path):
+    def run(kind, **changes):
+        train_network.main(kind, train_network.Config(data=tmp_path / "set", **changes))
+
+    with pytest.raises(SystemExit, match="--laid .*none.npz: no such file"):
+        run("color", laid=tmp_path / "none.npz")
+    with pytest.raises(SystemExit, match="expected with train_color"):
+        run("height", laid=evaluate.SHIPPED / "height.npz")
+    with pytest.raises(SystemExit, match="expected a height network"):
+        run("color", laid=evaluate.SHIPPED / "color.npz")
+    assert not (tmp_path / "set").exists()
