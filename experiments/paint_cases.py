@@ -18,6 +18,7 @@ from jaxbrush.canvas import flatten
 from jaxbrush.paint import (
     PaintConfig,
     empty_canvas,
+    heightfield_stroke,
     load_brush,
     paint_stroke,
     presets,
@@ -35,6 +36,7 @@ PALETTE = np.array([(0.80, 0.16, 0.02), (0.02, 0.25, 0.10)])
 """Linear RGB of the brush's pigment and the band's."""
 
 paint = jax.jit(paint_stroke)
+films = jax.jit(heightfield_stroke)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -137,7 +139,8 @@ def lay(setting: Setting, length: float, stamps: int = 0):
     track = padded(track, max(stamps, track.time.shape[0]))
     canvas = canvas_of(config)
     brush = load_brush(config, params, setting.bristles, 0.8, jnp.asarray([1.0, 0.0]))
-    call = lambda: paint(config, params, canvas, brush, track)  # noqa: E731
+    stroke = films if config.layers == 2 else paint
+    call = lambda: stroke(config, params, canvas, brush, track)  # noqa: E731
     after, left, report = jax.block_until_ready(call())
     held = lambda b: float(np.sum(np.asarray(b.tip + b.reservoir, np.float64)))  # noqa: E731
     on = lambda c: float(np.sum(np.asarray(c, np.float64))) * config.cell  # noqa: E731
