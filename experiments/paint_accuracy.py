@@ -204,7 +204,7 @@ def chart(points: list[dict], results: dict, options: Config, path: Path):
                  ha="right", color=color)  # fmt: skip
     real = points[1]["spacing"], points[1]["beads"][0]
     axis.plot(*real, "o", ms=13, mew=1.6, mfc="none", mec=INK)
-    note(axis, "realtime", real, (-10, -16), weight="bold", ha="right")
+    note(axis, "realtime", real, (12, -4), weight="bold")
     axis.axhline(VISIBLE, color=INK, lw=0.8, ls=(0, (4, 3)))
     axis.set(xlabel="between stamps [mm]", ylabel="spectrum at that period over its surroundings",
              title="Beads, and how tall", ylim=(0.0, None), xlim=(0.2, 0.55))  # fmt: skip

@@ -31,7 +31,8 @@ def offline(bristles: int = REAL) -> tuple[PaintConfig, PaintParams, float]:
 
 
 def realtime(bristles: int = REAL // 2) -> tuple[PaintConfig, PaintParams, float]:
-    """The fastest that still shows the grooves and no beads: TIMES
+    """The fastest that still shows the grooves and no beads: 0.7 ms a stamp, 4.1 ms a
+    millimetre with 130 bristles; 117 um rms, 4.0 Delta E.
 
     Pixels of 0.25 mm and as much between stamps, cells 0.2 mm high, 2 + 3 rounds, fluxes without
     limiter: at this interval it sharpens nothing. Stamps twice as far apart save a third and cost
