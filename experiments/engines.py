@@ -227,7 +227,7 @@ class Neural:
 
         self._canvas = painter.paint_stroke(
             self.options, self.nets, self._canvas, deed.brush, np.asarray(deed.color, np.float32),
-            deed.stroke, donate=True, watch=watch,
+            deed.stroke, donate=True, watch=watch, load=deed.load,
         )  # fmt: skip
         return stages
 
@@ -258,7 +258,7 @@ def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, dee
         for warm in (False, True):
             took.clear(), late.clear()
             for deed in deeds:
-                session.begin(deed.brush, deed.color)
+                session.begin(deed.brush, deed.color, load=deed.load)
                 pen = jax.tree.map(np.asarray, deed.stroke)
                 frame = np.floor((pen.time - pen.time[0]) / FRAME).astype(int)
                 for number in np.unique(frame):
@@ -283,8 +283,8 @@ def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, dee
 
 
 SHIPPED = (Path("checkpoints/height.npz"), Path("checkpoints/color.npz"))
-TAUGHT = dataclasses.replace(data.PRESETS["tiny"].pairs.paint, window=48)
-"""The simulator as the networks were taught by it, stamps a pixel apart."""
+TAUGHT = data.PRESETS["cpu"].pairs
+"""The simulator as the networks were taught by it."""
 
 
 def make(name: str, shape, deeds: list[Deed], weights=SHIPPED):
@@ -296,6 +296,6 @@ def make(name: str, shape, deeds: list[Deed], weights=SHIPPED):
     if name == "neural":
         return Neural(painter.PainterConfig(), painter.load_nets(*weights), shape)
     if name == "offline":
-        return Simulator(TAUGHT, PIXEL, shape, palette_of(deeds), None)
+        return Simulator(TAUGHT.paint, TAUGHT.spacing, shape, palette_of(deeds), None)
     config, _, spacing = presets.realtime()
     return Simulator(config, spacing, shape, palette_of(deeds), presets.REAL // 2)

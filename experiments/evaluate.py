@@ -86,7 +86,10 @@ def main(options: Config) -> None:
         kind = KINDS[exported.config.outputs]
         seen = train_network.Config(**exported.card.get("inputs", {}))
         pairs = train_network.pairs_of(found, options.split, index, kind, seen)
-        rows = evaluation.compare(kind, predicted(exported, pairs), pairs, scale)
+        try:
+            rows = evaluation.compare(kind, predicted(exported, pairs), pairs, scale)
+        except ValueError as error:
+            raise SystemExit(f"{path}: {error}") from error
         if kind == "color" and chained and seen.height:
             laid = train_network.predicted_heights(found, options.split, index, chained)
             used = with_height(pairs, data.network_height(laid))

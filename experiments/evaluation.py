@@ -149,7 +149,14 @@ def _painted(options, variables, batch):
 
 
 def paint(options: GeneratorConfig, variables: dict, batch: Batch) -> np.ndarray:
-    """The network's pictures of all pairs, (n, h, w, k)."""
+    """The network's pictures of all pairs, (n, h, w, k).
+
+    Raises:
+      ValueError: a network of other inputs.
+    """
+    have, given = variables["params"]["encode1"]["kernel"].shape[2], batch.inputs.shape[-1]
+    if have != given:
+        raise ValueError(f"a network of {have} inputs: expected {given}, one for each map given")
     out = []
     for first in range(0, len(batch.inputs), TOGETHER):
         piece = slice(first, first + TOGETHER)

@@ -13,7 +13,7 @@ from experiments.common import console
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import checkpoint, data, stages
 
-HELD = 2
+HELD = 5
 """Canvases of the training split, at most, that choose the best checkpoint and are not learned
 from; the test split is seen once, at the end."""
 
@@ -30,7 +30,9 @@ class Config(training.Options):
     """Height: what it is told of the hand: the pressure map (the paper's way), the sweep count (its
     Figure 3), or both."""
     time: bool = True
-    """Color: with the time map (paper Figure 4)."""
+    """With the time map (paper Figure 4)."""
+    load: bool = True
+    """Height: with the load of the brush."""
     height: bool = True
     """Color: with the new height (paper Figure 5)."""
     laid: Path | None = None
@@ -69,7 +71,7 @@ class Stored:
 def batch_of(raw: dict, kind: str, options: Config):
     """Inputs, target and mask of a network, as the options ask for."""
     if kind == "height":
-        return data.height_batch(raw, options.hand)
+        return data.height_batch(raw, options.hand, options.time, options.load)
     return data.color_batch(raw, options.time, options.height)
 
 
@@ -110,7 +112,8 @@ def _laying(kind: str, options: Config):
     return exported
 
 
-def main(kind: str, options: Config) -> None:
+def main(kind: str, options: Config) -> dict:
+    """Makes the data set if need be, and trains; returns what `training.fit` does."""
     try:
         laying = _laying(kind, options)
         folder = make_dataset.build(options.preset, options.data)
@@ -129,7 +132,7 @@ def main(kind: str, options: Config) -> None:
     )
     scale = Scale(data.LEVELS["height"], found.options.pairs.paint.pixel)
     try:
-        training.fit(
+        result = training.fit(
             options,
             kind,
             Stored(found, known, kind, options, laid),
@@ -137,10 +140,11 @@ def main(kind: str, options: Config) -> None:
             take("test", np.arange(tests)),
             scale,
             data=about,
-            inputs={"hand": options.hand, "time": options.time, "height": options.height},
+            inputs={name: getattr(options, name) for name in ("hand", "time", "load", "height")},
             command=f"python -m experiments.train_{kind} {' '.join(sys.argv[1:])}".strip(),
         )
     except (ValueError, training.NotFinite) as error:
         raise SystemExit(f"{error}") from error
     where = options.out or Path("results") / f"train_{kind}"
     console.print(f"pictures: {where / 'samples.png'}   weights: {where / (kind + '.npz')}")
+    return result

@@ -33,7 +33,7 @@ class Options:
     """Folder for checkpoints, pictures and numbers [default: results/train_KIND]."""
     steps: int | None = None
     """Updates in all, those before a resume included."""
-    minutes: float | None = 6.5
+    minutes: float | None = 5.5
     """Time for training in this run, compilation included."""
     resume: bool = False
     """Goes on from the last checkpoint in the folder; without one, starts."""

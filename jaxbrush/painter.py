@@ -14,7 +14,7 @@ import numpy as np
 from jaxbrush import checkpoint, patches
 from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
-from jaxbrush.pairs import REACH
+from jaxbrush.pairs import LOAD, REACH
 from jaxbrush.patches import Box, Layout, Rect
 from jaxbrush.raster import trajectory_maps
 from jaxbrush.stages import Nets as Nets
@@ -34,7 +34,7 @@ from jaxbrush.stages import (
 from jaxbrush.stages import paint_on as paint_on
 from jaxbrush.stylus import Stroke, stamps_needed
 
-HEIGHT_INPUTS, COLOR_INPUTS = 3, 8
+HEIGHT_INPUTS, COLOR_INPUTS = 5, 8
 
 
 def make_nets(height: checkpoint.Exported, color: checkpoint.Exported) -> Nets:
@@ -64,8 +64,8 @@ def load_nets(height_path, color_path) -> Nets:
     return make_nets(checkpoint.load(height_path), checkpoint.load(color_path))
 
 
-def _trace_bounds(options, brush, stroke):
-    track = trace(options, brush, stroke)
+def _trace_bounds(options, brush, stroke, load):
+    track = trace(options, brush, stroke, load)
     return track, touches(options, track)
 
 
@@ -117,6 +117,12 @@ def _count(options: PainterConfig, need: int) -> int:
     return max(4, options.batch, 3 * power // 4 if need <= 3 * power // 4 else power)
 
 
+def check_load(load):
+    """Raises ValueError unless 0 < load <= 1."""
+    if not 0.0 < float(load) <= 1.0:
+        raise ValueError(f"load = {load!r}: expected a share of what the brush holds, in (0, 1]")
+
+
 def padded(stroke: Stroke) -> Stroke:
     """A stroke with a power of 2 of samples, by numpy: each length would compile anew."""
     have = stroke.time.shape[0]
@@ -129,11 +135,12 @@ def padded(stroke: Stroke) -> Stroke:
     return longer
 
 
-def _begin(options: PainterConfig, brush: BrushParams, stroke: Stroke):
+def _begin(options: PainterConfig, brush: BrushParams, stroke: Stroke, load=LOAD):
     """Track and touches of a stroke, stamps in a bucket; not jittable."""
     stroke = padded(stroke)
     stamps = bucket(int(_needed_stamps(options, brush, stroke)), options.stamps)
-    return _trace(options, brush, _place_stamps(options, brush, stroke, stamps=stamps))
+    placed = _place_stamps(options, brush, stroke, stamps=stamps)
+    return _trace(options, brush, placed, jnp.asarray(load, float))
 
 
 def reached(shape, bounds) -> tuple[slice, slice] | None:
@@ -212,7 +219,7 @@ def plan(options: PainterConfig, canvas: Canvas, brush: BrushParams, stroke: Str
 
 def paint_stroke(
     options: PainterConfig, nets: Nets, canvas: Canvas, brush: BrushParams, color, stroke: Stroke,
-    donate: bool = False, watch=lambda stage, value: None,
+    donate: bool = False, watch=lambda stage, value: None, load=LOAD,
 ) -> Canvas:  # fmt: skip
     """Paints one stroke on a canvas; picks the sizes itself, so it cannot be jitted.
 
@@ -222,16 +229,18 @@ def paint_stroke(
       donate: paints into the canvas that is given, which is then gone; else all of it is copied.
       watch: called after each stage with its name and what it made: brush (track, bounds), maps,
         patches, networks, canvas.
+      load: share of what the brush holds that it is loaded with, (0, 1].
 
     Returns:
       Canvas; pixels that the dilated stroke does not reach keep their bits.
 
     Raises:
       ValueError: shapes that do not fit, a box larger than PainterConfig.cells, a stroke or brush
-        that is not finite.
+        that is not finite, a load out of range.
     """
     check_canvas(canvas)
-    track, bounds = _begin(options, brush, stroke)
+    check_load(load)
+    track, bounds = _begin(options, brush, stroke, load)
     watch("brush", (track, bounds))
     return paint_track(options, nets, canvas, track, bounds, color, donate, watch)
 

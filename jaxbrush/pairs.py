@@ -24,7 +24,8 @@ from jaxbrush.paint import (
     paint_stroke,
     weave,
 )
-from jaxbrush.raster import make_grid, trajectory_maps
+from jaxbrush.paint.state import TUNED_AREA, TUNED_HAIRS
+from jaxbrush.raster import TrajectoryMaps, make_grid, trajectory_maps
 from jaxbrush.raster.grid import dilate
 from jaxbrush.structs import config, state
 from jaxbrush.stylus import Stroke, random_stroke, resample, transform, way
@@ -34,6 +35,8 @@ COAT = 0.2
 """[mm] above the canvas at which the paint on a bristle touches it."""
 MARGIN = 32
 """Pixels of canvas around what is kept, so that a stroke over its edge piles nothing up there."""
+LOAD = 0.85
+"""Share of what a brush holds that it is loaded with, where nothing else is said."""
 REACH = 8
 """Pixels beyond the bristles that a stroke may change: how far the mask is dilated."""
 
@@ -41,12 +44,14 @@ REACH = 8
 @config
 class PairConfig:
     """size: of the canvas, square [pixels]. strokes: painted on each canvas, one pair each. stamps:
-    of a stroke at most; longer ones are made smaller. bristles: simulated. paint, brush: the
-    simulators."""
+    of a stroke at most; longer ones are made smaller. spacing: of the stamps that are painted
+    [mm], a pixel or a whole part of it; maps are drawn a pixel apart, as in use. bristles:
+    simulated. paint, brush: the simulators."""
 
     size: int = 128
     strokes: int = 4
-    stamps: int = 160
+    stamps: int = 320
+    spacing: float = 0.0625
     bristles: int = 128
     paint: PaintConfig = PaintConfig(window=48)  # noqa: RUF009
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
@@ -55,11 +60,21 @@ class PairConfig:
         for name, least in (("strokes", 1), ("stamps", 8), ("bristles", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"PairConfig.{name} = {getattr(self, name)}: expected >= {least}")
+        if not self.spacing > 0.0 or abs(self.every * self.spacing - self.paint.pixel) > 1e-9:
+            raise ValueError(
+                f"PairConfig.spacing = {self.spacing}: expected the pixel, {self.paint.pixel} mm, "
+                "or a whole part of it"
+            )
         if self.size < self.paint.window or self.size % 4:
             raise ValueError(
                 f"PairConfig.size = {self.size}: expected a multiple of 4, at least the window, "
                 f"{self.paint.window}"
             )
+
+    @property
+    def every(self) -> int:
+        """Stamps a pixel."""
+        return max(1, round(self.paint.pixel / self.spacing))
 
 
 @state
@@ -78,7 +93,8 @@ class Picture:
     """What a pair stores of a canvas and a stroke; colors in sRGB, [0, 1].
 
     height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
-    time: (h, w) and trajectory: (h, w, 3) maps of the stroke; time by the clock of `on_way` [mm].
+    time, load: (h, w) and trajectory: (h, w, 3) maps of the stroke; sweeps and load of a `Loaded`
+    track, time by the clock of `on_way` [mm].
     mask: (h, w) 1 where it may have changed something. reached: () whether the brush stayed inside
     the simulated window.
     """
@@ -89,6 +105,7 @@ class Picture:
     sweeps: jax.Array
     trajectory: jax.Array
     time: jax.Array
+    load: jax.Array
     new_height: jax.Array
     new_color: jax.Array
     mask: jax.Array
@@ -113,7 +130,7 @@ def _draw_stroke(options: PairConfig, key, depth):
     # The way of the handle, lifting included, must not ask for more stamps than there are.
     way = jnp.sum(jnp.sqrt(jnp.sum(jnp.diff(stroke.position, axis=0) ** 2, axis=1) + 1e-12))
     lift = depth * jnp.sum(jnp.abs(jnp.diff(stroke.pressure)))
-    room = jnp.maximum(0.95 * options.stamps * options.paint.pixel - lift, 1.0)
+    room = jnp.maximum(0.95 * options.stamps * options.spacing - lift, 1.0)
     middle = 0.5 * (stroke.position.max(0) + stroke.position.min(0))
     place = jax.random.uniform(shift, (2,), minval=0.25 * side, maxval=0.75 * side)
     stroke = transform(
@@ -123,7 +140,7 @@ def _draw_stroke(options: PairConfig, key, depth):
         scale=jnp.minimum(1.0, room / way),
         center=middle,
     )
-    return resample(stroke, options.stamps, options.paint.pixel, np.inf, depth)
+    return resample(stroke, options.stamps, options.spacing, np.inf, depth)
 
 
 def draw(options: PairConfig, key) -> Plan:
@@ -151,15 +168,43 @@ def draw(options: PairConfig, key) -> Plan:
         brush=brush,
         paint=paint,
         mix=(1.0 - share) * pick(first) + share * pick(second),
-        load=jax.random.uniform(load, (), minval=0.7, maxval=1.0),
+        # Mostly full, some nearly dry.
+        load=1.0 - 0.75 * jax.random.uniform(load, ()) ** 2,
     )
 
 
-def coated(track: BristleTrack, coat: float = COAT) -> BristleTrack:
+@state
+class Loaded(BristleTrack):
+    """The track of a loaded brush. hairs: (t,) of the simulator's paint constants that a bristle
+    stands for, of `TUNED_HAIRS` on `TUNED_AREA`: what it lays where it sweeps goes with them. load:
+    (t,) share of what it holds that the brush was loaded with."""
+
+    hairs: jax.Array
+    load: jax.Array
+
+
+def loaded(track: BristleTrack, brush: BrushParams, load=LOAD, coat: float = COAT) -> Loaded:
     """The track as maps of a loaded brush see it: a bristle touches where its coat of paint does,
     `coat` [mm] above the canvas, there without force."""
     near = (track.position[:, :, 2] < coat) & track.valid[:, None, None]
-    return dataclasses.replace(track, force=jnp.where(near, jnp.maximum(track.force, 1e-3), 0.0))
+    own = {f.name: getattr(track, f.name) for f in dataclasses.fields(track)}
+    own["force"] = jnp.where(near, jnp.maximum(track.force, 1e-3), 0.0)
+    each = brush.area / track.position.shape[-1] * np.float32(TUNED_HAIRS / TUNED_AREA)
+    every = jnp.ones_like(track.time)
+    return Loaded(**own, hairs=each * every, load=jnp.asarray(load, float) * every)
+
+
+def scaled_maps(maps: TrajectoryMaps, track: Loaded) -> dict[str, jax.Array]:
+    """Maps as the networks are told them: pressure, sweeps by hairs in place of bristles, time by
+    the track's clock, load where the brush came, (h, w) each, trajectory (h, w, 3)."""
+    end = jnp.max(jnp.where(track.valid, track.time, 0.0))
+    return {
+        "pressure": maps.pressure,
+        "sweeps": track.hairs[0] * maps.sweeps,
+        "time": end * maps.time,
+        "load": track.load[0] * maps.coverage,
+        "trajectory": maps.color,
+    }
 
 
 def on_way(track: BristleTrack, stroke: Stroke, depth) -> BristleTrack:
@@ -172,11 +217,6 @@ def on_way(track: BristleTrack, stroke: Stroke, depth) -> BristleTrack:
       stroke: that the track follows. depth: of the brush at full pressure [mm].
     """
     return dataclasses.replace(track, time=way(stroke, depth))
-
-
-def clock_map(share, track: BristleTrack):
-    """The time map of `trajectory_maps`, a share of the stroke, by the clock of its track."""
-    return share * jnp.max(jnp.where(track.valid, track.time, 0.0))
 
 
 def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
@@ -192,10 +232,10 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
     edge = MARGIN * options.paint.pixel
     shift = jnp.asarray([edge, edge, 0.0], track.position.dtype)[None, None, :, None]
     moved = dataclasses.replace(track, position=track.position + shift)
-    loaded: BrushPaint = load_brush(
+    dipped: BrushPaint = load_brush(
         options.paint, plan.paint, options.bristles, plan.load, plan.mix
     )
-    after, _, report = paint_stroke(options.paint, plan.paint, canvas, loaded, moved, tooth)
+    after, _, report = paint_stroke(options.paint, plan.paint, canvas, dipped, moved, tooth)
     kept = slice(MARGIN, MARGIN + options.size)
     seen = lambda c: flatten(  # noqa: E731
         c[:, :, kept, kept], options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
@@ -206,16 +246,14 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
         thick, options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
     ).color[0, 0]
     grid = make_grid((options.size, options.size), pixel=options.paint.pixel)
-    drawn = on_way(coated(track), plan.stroke, plan.brush.press_depth)
+    drawn = on_way(loaded(track, plan.brush, plan.load), plan.stroke, plan.brush.press_depth)
+    drawn = jax.tree.map(lambda x: x[:: options.every], drawn)
     maps = trajectory_maps(grid, drawn, to_srgb(own))
     before, now = seen(canvas), seen(after)
     return after, Picture(
         height=before.height,
         color=to_srgb(before.color),
-        pressure=maps.pressure,
-        sweeps=maps.sweeps,
-        trajectory=maps.color,
-        time=clock_map(maps.time, drawn),
+        **scaled_maps(maps, drawn),
         new_height=now.height,
         new_color=to_srgb(now.color),
         mask=dilate(maps.coverage, REACH),

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbrush.brush import BrushParams, advance, begin
 from jaxbrush.painter import PainterConfig
-from jaxbrush.pairs import coated
+from jaxbrush.pairs import LOAD, loaded
 from jaxbrush.stages import on_steps, touches
 from jaxbrush.stylus import Stroke, make_stroke
 
@@ -17,9 +17,9 @@ FIELDS = ("time", "x", "y", "pressure", "altitude", "azimuth", "twist")
 _UPRIGHT = {"altitude": 0.5 * np.pi, "azimuth": 0.0, "twist": 0.0}
 
 
-def _piece(options: PainterConfig, brush, motion, stroke, way):
+def _piece(options: PainterConfig, brush, load, motion, stroke, way):
     track, motion = advance(options.brush, brush, motion, stroke)
-    track = on_steps(options, dataclasses.replace(coated(track), time=way))
+    track = on_steps(options, dataclasses.replace(loaded(track, brush, load), time=way))
     return track, touches(options, track), motion
 
 
@@ -30,8 +30,8 @@ _begin = jax.jit(begin, static_argnums=0)
 class Pen:
     """The stroke under the pen: its samples, and how far the preview has moved the brush."""
 
-    def __init__(self, options: PainterConfig, brush: BrushParams):
-        self.options, self.brush = options, brush
+    def __init__(self, options: PainterConfig, brush: BrushParams, load: float = LOAD):
+        self.options, self.brush, self.load = options, brush, np.float32(load)
         self.depth = float(brush.press_depth)
         self.samples = {name: np.zeros(0) for name in FIELDS}
         self.way = np.zeros(0)
@@ -71,7 +71,9 @@ class Pen:
             self.motion = _begin(config, self.brush, self._stamps(0)[0])
         while True:
             piece, way = self._stamps(self.done)
-            track, bounds, motion = _advance(self.options, self.brush, self.motion, piece, way)
+            track, bounds, motion = _advance(
+                self.options, self.brush, self.load, self.motion, piece, way
+            )
             # Only once the pen is past it, a piece is what it will stay.
             final = self.way[-1] >= self.done + PIECE
             self.tip = track, bounds

@@ -17,6 +17,7 @@ from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
 from jaxbrush.data import PREVIEW_FILM
 from jaxbrush.painter import Nets, PainterConfig
+from jaxbrush.pairs import LOAD
 from jaxbrush.patches import Box
 from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.recordings import BrushEvent, ColorEvent, StrokeEvent
@@ -48,6 +49,7 @@ class _Job:
     brush: BrushParams
     color: tuple[float, float, float]
     event: dict
+    load: float = LOAD
     stroke: Stroke | None = None
     samples: dict | None = None
     cancelled: bool = False
@@ -113,24 +115,28 @@ class Session:
         """The picture with previews of what is not finished; a copy, as numpy arrays."""
         return jax.tree.map(np.copy, self._screen.canvas)
 
-    def begin(self, brush: BrushParams, color, event: dict | None = None) -> int:
+    def begin(
+        self, brush: BrushParams, color, event: dict | None = None, load: float = LOAD
+    ) -> int:
         """Sets the brush down for a stroke.
 
         Args:
           brush: of `options.brush`. color: (3,) linear RGB. event: the brush in the recording.
+          load: share of what the brush holds that it is loaded with, (0, 1].
 
         Returns:
           Number of the stroke.
 
         Raises:
-          RuntimeError: a stroke is open, or the session is closed.
+          RuntimeError: a stroke is open, or the session is closed. ValueError: a load out of range.
         """
+        painter.check_load(load)
         if self._closed or self._open:
             raise RuntimeError("the session is closed" if self._closed else "a stroke is open")
         self._count += 1
         color = tuple(float(c) for c in color)
-        self._open = _Job(self._count, brush, color, event or {})
-        self._pen = Pen(self.options, brush)
+        self._open = _Job(self._count, brush, color, event or {}, float(load))
+        self._pen = Pen(self.options, brush, load)
         self._lifted.clear()
         return self._count
 
@@ -248,11 +254,12 @@ class Session:
         """The strokes so far, those taken back left out."""
         events, brush, color = [], None, None
         for job in self._strokes:
-            if job.event != brush:
-                events.append(BrushEvent(job.event))
+            event = {**job.event, "load": job.load}
+            if event != brush:
+                events.append(BrushEvent(event))
             if job.color != color:
                 events.append(ColorEvent(job.color))
-            brush, color = job.event, job.color
+            brush, color = event, job.color
             s = {n: tuple(float(v) for v in job.samples[n]) for n in FIELDS}
             events.append(StrokeEvent(s["time"], *(s[n] for n in FIELDS[1:])))
         h, w = self._canvas.height.shape
@@ -350,7 +357,8 @@ class Session:
             watch("brush", found)
             new = painter.paint_track(*given, *found, color, watch=watch)
         else:
-            new = self._paint(*given, job.brush, color, job.stroke, watch=watch)
+            new = self._paint(*given, job.brush, color, job.stroke, watch=watch,
+                              load=job.load)  # fmt: skip
         return jax.block_until_ready(new), box[0] if box else None
 
     def _finish(self, job: _Job, before: Canvas, after: Canvas | None, box):

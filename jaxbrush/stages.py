@@ -22,7 +22,7 @@ from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, rollout
 from jaxbrush.canvas import Canvas, from_srgb, to_srgb
 from jaxbrush.metrics import image_scale
 from jaxbrush.models import Generator, GeneratorConfig
-from jaxbrush.pairs import REACH, clock_map, coated, on_way
+from jaxbrush.pairs import LOAD, REACH, Loaded, loaded, on_way, scaled_maps
 from jaxbrush.patches import Box, Layout, PatchConfig, Rect
 from jaxbrush.raster import WIDTH, dilate, trajectory_maps
 from jaxbrush.structs import config, state
@@ -107,14 +107,15 @@ class Nets:
 
 @state
 class Drawn:
-    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm] (h, w, 1), trajectory
-    (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as there, 0 off the canvas. share:
-    (h, w, 1) of what is painted in what the canvas becomes: 1 where bristles came, falling to 0
-    within `RIM`. whole: () as in TrajectoryMaps."""
+    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm], load (h, w, 1),
+    trajectory (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as there, 0 off the canvas.
+    share: (h, w, 1) of what is painted in what the canvas becomes: 1 where bristles came, falling
+    to 0 within `RIM`. whole: () as in TrajectoryMaps."""
 
     pressure: jax.Array
     sweeps: jax.Array
     time: jax.Array
+    load: jax.Array
     trajectory: jax.Array
     mask: jax.Array
     share: jax.Array
@@ -142,10 +143,10 @@ def place_stamps(options: PainterConfig, brush: BrushParams, stroke: Stroke, sta
     return resample(stroke, stamps, options.pixel, np.inf, brush.press_depth)
 
 
-def trace(options: PainterConfig, brush: BrushParams, stroke: Stroke) -> BristleTrack:
+def trace(options: PainterConfig, brush: BrushParams, stroke: Stroke, load=LOAD) -> Loaded:
     """Moves a loaded brush along the stamps of a stroke; the track's clock is the way [mm]."""
-    track = on_way(coated(rollout(options.brush, brush, stroke)), stroke, brush.press_depth)
-    return on_steps(options, track)
+    track = loaded(rollout(options.brush, brush, stroke), brush, load)
+    return on_steps(options, on_way(track, stroke, brush.press_depth))
 
 
 STEPS = 2048
@@ -191,7 +192,7 @@ def faded(cover):
     return share, cover
 
 
-def draw(options: PainterConfig, box: Box | Rect, shape, track: BristleTrack, color) -> Drawn:
+def draw(options: PainterConfig, box: Box | Rect, shape, track: Loaded, color) -> Drawn:
     """Draws the maps of a stroke on its box, scaled as in training pairs.
 
     Args:
@@ -206,11 +207,11 @@ def draw(options: PainterConfig, box: Box | Rect, shape, track: BristleTrack, co
     # Kept as an array: worked out again at every shift of the dilation it is slow.
     cover = jax.lax.optimization_barrier(maps.coverage)
     share, grown = faded(cover)
+    told = scaled_maps(maps, track)
+    trajectory = told.pop("trajectory")
     return Drawn(
-        pressure=maps.pressure[..., None],
-        sweeps=maps.sweeps[..., None],
-        time=clock_map(maps.time, track)[..., None],
-        trajectory=maps.color,
+        **{name: x[..., None] for name, x in told.items()},
+        trajectory=trajectory,
         mask=inside * dilate(grown, REACH - RIM)[..., None],
         share=inside * share[..., None],
         whole=maps.whole,
@@ -226,10 +227,10 @@ def cut(
       layout: of the box; a Rect is its own.
 
     Returns:
-      dict of height [mm], pressure, sweeps, time, mask, share (n, size, size, 1), color, trajectory
-      (n, size, size, 3) in sRGB; of a Rect one, of its sides.
+      dict of height [mm], pressure, sweeps, time, load, mask, share (n, size, size, 1), color,
+      trajectory (n, size, size, 3) in sRGB; of a Rect one, of its sides.
     """
-    names = ("pressure", "sweeps", "time", "mask", "share", "trajectory")
+    names = ("pressure", "sweeps", "time", "load", "mask", "share", "trajectory")
     field = jnp.concatenate([getattr(drawn, name) for name in names], axis=-1)
     if isinstance(box, Rect):
         field, corner = field[None], box.corner[None]
@@ -239,7 +240,7 @@ def cut(
     return {
         "height": patches.cut_canvas(canvas.height, corner, sides)[..., None],
         "color": to_srgb(patches.cut_canvas(canvas.color, corner, sides)),
-        **dict(zip(names, jnp.split(field, (1, 2, 3, 4, 5), axis=-1), strict=True)),
+        **dict(zip(names, jnp.split(field, (1, 2, 3, 4, 5, 6), axis=-1), strict=True)),
     }
 
 
@@ -335,7 +336,7 @@ def lay(
 
 def paint_on(
     options: PainterConfig, sizes: Sizes, nets: Nets, canvas: Canvas, brush: BrushParams, color,
-    stroke: Stroke, first,
+    stroke: Stroke, first, load=LOAD,
 ):  # fmt: skip
     """Paints one stroke in given sizes; pure: jit it, and differentiate it in all but `first`. For
     slopes of positions `options.edge` makes the maps soft.
@@ -344,13 +345,14 @@ def paint_on(
       sizes, first: from `plan`; first (2,) int is the number of the box's first patch along y, x,
         or the first pixel of the rectangle.
       canvas: (h, w). color: (3,) of the paint, linear RGB. stroke: samples of the stylus [mm].
+      load: () share of what the brush holds.
 
     Returns:
       (Canvas, ok): ok () bool is False if the count is too small, or soft maps have gaps.
     """
     check_canvas(canvas)
     first = jnp.asarray(first, jnp.int32)
-    track = trace(options, brush, place_stamps(options, brush, stroke, sizes.stamps))
+    track = trace(options, brush, place_stamps(options, brush, stroke, sizes.stamps), load)
     if sizes.sides is not None:
         rect = Rect(corner=first, sides=sizes.sides)
         drawn = draw(options, rect, canvas.height.shape, track, color)

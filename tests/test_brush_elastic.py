@@ -24,7 +24,8 @@ jit_rollout = jax.jit(rollout)
 
 def straight(segments, stretch=7.07e5, bending=BENDING, **values):
     """One straight bristle along -z without damping or friction."""
-    default = {"damping": 0.0, "friction": 0.0, "press_depth": 1.0, "press_force": 100.0}
+    default = {"damping": 0.0, "friction": 0.0, "press_depth": 1.0, "press_force": 100.0,
+               "area": 0.02}  # fmt: skip
     scalars = {k: jnp.asarray(v, float) for k, v in (default | values).items()}
     rest = jnp.concatenate([jnp.zeros((segments, 2, 1)), -jnp.ones((segments, 1, 1))], axis=1)
     return BrushParams(

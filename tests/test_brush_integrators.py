@@ -41,6 +41,7 @@ def straight(segments, ratio=4.0, damping=0.0):
         friction=scalar(0.0),
         press_depth=scalar(1.0),
         press_force=scalar(100.0),
+        area=scalar(0.02),
     )
 
 

@@ -16,7 +16,7 @@ from jaxbrush.paint import PaintConfig
 from jaxbrush.train import Batch
 
 SMALL = pairs.PairConfig(
-    size=48, strokes=2, stamps=24, bristles=24,
+    size=48, strokes=2, stamps=48, bristles=24,
     paint=PaintConfig(window=32, layers=8, pigments=3, samples=2, sweeps=1, viscous=2, pressure=4),
 )  # fmt: skip
 OPTIONS = data.DataConfig(SMALL, train=2, test=1, shard=1)
@@ -64,20 +64,25 @@ def test_a_stroke_changes_its_mask_and_is_the_next_background(folder):
     assert p["height"][0].max() == 0.0
     # Where no bristle came, the maps are empty.
     bare = p["mask"] == 0.0
-    for name in ("pressure", "sweeps", "time"):
+    for name in ("pressure", "sweeps", "time", "load"):
         assert np.all(p[name][bare] == 0.0)
 
 
 def test_batches_are_in_network_scale(folder):
     p = data.load(folder).take("test", [0, 1])
     height = data.height_batch(p)
-    assert height.inputs.shape == (2, 48, 48, 3) and height.target.shape == (2, 48, 48, 1)
+    assert height.inputs.shape == (2, 48, 48, 5) and height.target.shape == (2, 48, 48, 1)
     color = data.color_batch(p)
     assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
     assert data.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
     alone = [data.height_batch(p, hand) for hand in ("pressure", "sweeps")]
     np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
     np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
+    np.testing.assert_array_equal(height.inputs[..., 3:4], data.network_time(p["time"]))
+    assert data.height_batch(p, time=False, load=False).inputs.shape[-1] == 3
+    # One load a stroke, where the brush came.
+    for load, came in zip(p["load"], np.asarray(data.touched(p)), strict=True):
+        assert 0.25 <= load.max() <= 1.0 and np.ptp(load[came]) < 1e-4
     # The clock is the way of the brush: some millimetres.
     assert 1.0 < p["time"].max() < 10.0
     scaled = np.asarray(data.network_time(jnp.asarray([0.0, 1.0, 2.0, 4.0, 64.0, 100.0])))
@@ -157,7 +162,7 @@ def test_long_strokes_fit_their_stamps():
 
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
-    for kind, outputs, channels in (("height", 1, 3), ("color", 3, 8)):
+    for kind, outputs, channels in (("height", 1, 5), ("color", 3, 8)):
         options = GeneratorConfig(outputs, width=0.05)
         variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
@@ -175,6 +180,11 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     assert "2 test pairs" in capsys.readouterr().out
     with pytest.raises(SystemExit, match="no such weights: .*absent.npz"):
         evaluate.main(evaluate.Config((tmp_path / "absent.npz",), data=folder, out=tmp_path))
+    options = GeneratorConfig(1, width=0.05)
+    other = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, 3)))
+    checkpoint.export(tmp_path / "other.npz", options, other, {})
+    with pytest.raises(SystemExit, match="other.npz: a network of 3 inputs: expected 5"):
+        evaluate.main(evaluate.Config((tmp_path / "other.npz",), data=folder, out=tmp_path))
     (tmp_path / "broken.npz").write_bytes(b"weights")
     with pytest.raises(SystemExit, match="broken.npz"):
         evaluate.main(evaluate.Config((tmp_path / "broken.npz",), data=folder, out=tmp_path))
@@ -224,7 +234,7 @@ def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
 def test_predicted_heights_are_laid_as_in_use(folder):
     found = data.load(folder)
     config = GeneratorConfig(outputs=1, width=0.05)
-    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 3)))
+    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 5)))
     network = checkpoint.Exported(variables, config, {})
     index = np.arange(found.count("train"))
     heights = train_network.predicted_heights(found, "train", index, network)

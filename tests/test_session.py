@@ -36,12 +36,13 @@ class Painter:
         self.go = threading.Event()
         self.go.set()
         self.begun, self.fail = threading.Event(), set()
-        self.count = 0
+        self.count, self.loads = 0, []
 
-    def __call__(self, options, nets, canvas, brush, color, stroke, watch):
+    def __call__(self, options, nets, canvas, brush, color, stroke, watch, load=painter.LOAD):
         self.begun.set()
         assert self.go.wait(60.0)
         self.count += 1
+        self.loads.append(load)
         if self.count in self.fail:
             raise FloatingPointError("networks out of order")
         place = np.asarray(stroke.position) / options.pixel
@@ -233,6 +234,17 @@ def test_closing_in_the_middle_loses_nothing(fake, brush):
         session.begin(brush, RED)
 
 
+def test_the_load_of_the_brush_goes_to_the_painter(session, fake, brush):
+    draw(session, brush)
+    with pytest.raises(ValueError, match="load = 1.2"):
+        session.begin(brush, RED, load=1.2)
+    session.begin(brush, RED, load=0.3)
+    session.add(*pen())
+    session.end()
+    assert session.wait(60.0)
+    assert fake.loads == [painter.LOAD, 0.3]
+
+
 def test_bad_samples_are_refused_whole(session, brush):
     with pytest.raises(RuntimeError, match="no stroke is open"):
         session.add(0.0, 1.0, 1.0, 0.5)
@@ -264,6 +276,7 @@ def test_a_recorded_session_comes_back_as_it_was(session, brush, tmp_path):
     back = recordings.read(tmp_path / "a.jsonl")
     kinds = [type(e).__name__ for e in back.events]
     assert kinds == ["BrushEvent", "ColorEvent", "StrokeEvent", "ColorEvent", "StrokeEvent"]
+    assert back.events[0].params == {"shape": "flat", "width": 2.0, "load": painter.LOAD}
     stroke = recordings.to_stroke(back, back.events[2])
     np.testing.assert_allclose(stroke.position, PATH, atol=1e-6)
     assert back.canvas == (SHAPE[1] * 0.125, SHAPE[0] * 0.125)

@@ -34,7 +34,7 @@ def nets(norm):
         draw = lambda x: jnp.asarray(rng.normal(0.0, 0.15, x.shape), jnp.float32)  # noqa: E731
         return jax.tree.map(draw, shapes), config
 
-    (height, height_config), (color, color_config) = one(3, 1), one(8, 3)
+    (height, height_config), (color, color_config) = one(5, 1), one(8, 3)
     return painter.Nets(height, color, height_config, color_config)
 
 

@@ -9,8 +9,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from jax.flatten_util import ravel_pytree
 
-from jaxbrush import checkpoint, losses
+from jaxbrush import checkpoint, losses, train
 from jaxbrush.models import Discriminator, DiscriminatorConfig, Generator, GeneratorConfig
 from jaxbrush.train import Batch, TrainConfig, inference_variables, make_params, make_train
 
@@ -161,6 +162,30 @@ def test_loss_falls_and_is_reported_finite(training):
     assert found[-1]["l1"] < 0.3 * found[0]["l1"]
     assert all(m["finite"] for m in found)
     assert 0.0 <= found[-1]["accuracy"] <= 1.0 and found[-1]["gradient_ratio"] > 0.0
+
+
+def test_one_odd_picture_does_not_undo_the_training(monkeypatch):
+    """After 400 usual updates: uncut, Adam's step is 8 times as long as usual."""
+    usual = [a_batch(k) for k in range(8)]
+    usual = [dataclasses.replace(x, inputs=0.1 * x.inputs, target=0.1 * x.target) for x in usual]
+    odd = dataclasses.replace(usual[0], inputs=200.0 * usual[0].inputs, target=a_batch(0).target)
+
+    def run(clip):
+        monkeypatch.setattr(train, "CLIP", clip)
+        init, update = make_train(TrainConfig(GeneratorConfig(width=WIDTH, norm="none"), None))
+        state, losses = init(jax.random.key(0), odd, make_params(10.0, 0.0, 1e-3)), []
+        for k in range(402):
+            before = ravel_pytree(state.generator)[0]
+            state, metrics = update(state, odd if k == 400 else usual[k % 8])
+            losses.append(float(metrics["l1"]))
+            if k == 400:
+                step = float(jnp.sqrt(jnp.mean((ravel_pytree(state.generator)[0] - before) ** 2)))
+        return step / 1e-3, losses[401] / np.mean(losses[392:400])
+
+    step, worse = run(train.CLIP)
+    assert step == pytest.approx(1.0, rel=1e-3) and worse < 1.4
+    step, worse = run(np.inf)
+    assert step > 4.0 and worse > 1.8
 
 
 def test_what_is_not_finite_is_reported_by_the_same_step(training):

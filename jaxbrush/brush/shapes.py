@@ -8,6 +8,8 @@ from jaxbrush.structs import config, state
 
 INTEGRATORS = ("symplectic_euler", "verlet", "implicit_euler", "projective", "quasi_static")
 SHAPES = ("round", "flat", "filbert", "fan", "rigger")
+DISCS = ("round", "rigger")
+"""Shapes whose ferrule is an ellipse; others have a rectangle."""
 
 HOG_DIAMETER = 0.15
 """Hog bristle [mm]."""
@@ -101,7 +103,8 @@ class BrushParams:
     to tip. length: (b,) [mm]. bending: (b,) EI [g mm^3/s^2]. stretch: (b,) EA [g mm/s^2].
     mass: (b,) per length [g/mm]. damping: () rate at which motion relative to the handle dies
     [1/s]. friction: () Coulomb coefficient on the canvas. press_depth: () [mm] at pressure 1.
-    press_force: () total normal force at pressure 1 [µN].
+    press_force: () total normal force at pressure 1 [µN]. area: () of the ferrule, which all
+    bristles share [mm^2].
     """
 
     root: jax.Array
@@ -114,6 +117,7 @@ class BrushParams:
     friction: jax.Array
     press_depth: jax.Array
     press_force: jax.Array
+    area: jax.Array
 
     def segment_length(self, segments: int):
         """Rest length l0 of a segment, (b,) [mm]."""
@@ -147,7 +151,7 @@ _DEFAULTS = {
 def _roots(key, shape: str, count: int, width, thickness):
     """Evenly spread, jittered clamp points in the ferrule, (2, b) [mm], and rim distance (b,)."""
     jitter = 0.25 * jax.random.normal(key, (2, count))
-    if shape in ("round", "rigger"):
+    if shape in DISCS:
         index = np.arange(count) + 0.5
         angle = index * np.pi * (3.0 - np.sqrt(5.0))
         radius = np.sqrt(index / count)
@@ -220,7 +224,7 @@ def make_brush(
     length = preset["length"] if length is None else length
     diameter = preset["diameter"] if diameter is None else diameter
     splay = preset["splay"] if splay is None else splay
-    n = config.segments
+    n, disc = config.segments, shape in DISCS
 
     place, tilt, curl, cut = jax.random.split(key, 4)
     unit, root, rim = _roots(place, shape, bristles, width, thickness)
@@ -257,4 +261,5 @@ def make_brush(
         friction=jnp.asarray(friction, float),
         press_depth=jnp.asarray(press_depth, float),
         press_force=jnp.asarray(press_force, float),
+        area=jnp.asarray(width, float) * thickness * (0.25 * np.pi if disc else 1.0),
     )

@@ -86,6 +86,7 @@ class PaintParams:
     squeeze: jax.Array  # [1/mm]
     pickup: jax.Array  # [1/mm]
     exchange: jax.Array  # [1/mm]
+    exchange_depth: jax.Array  # of the paint that bristles exchange with [mm]
     refill: jax.Array  # [1/mm]
     soak: jax.Array  # travel that contact at rest counts as [mm/s]
     drag: jax.Array  # Brinkman drag of the hair over viscosity, per hair fraction [1/mm^2]
@@ -107,8 +108,9 @@ def make_params(**changes) -> PaintParams:
         "hair_radius": 0.03, "hair_length": 0.9, "coat_dry": 0.33, "coat_full": 8.0,
         "compliance": 0.4, "tip_volume": 7.5, "reservoir_volume": 63.0, "contact_area": 20.0,
         "deposit": 12.8, "squeeze": 0.4, "cling": 4.0, "pickup": 4.0, "exchange": 0.48,
-        "refill": 0.8, "soak": 10.0, "drag": 256.0, "lid": 0.9, "source": 1.0, "yield_share": 0.02,
-        "relax": 0.015625, "relax_slope": 0.752, "opacity": 0.03,
+        "exchange_depth": 0.125, "refill": 0.8, "soak": 10.0, "drag": 256.0, "lid": 0.9,
+        "source": 1.0, "yield_share": 0.02, "relax": 0.015625, "relax_slope": 0.752,
+        "opacity": 0.03,
     }  # fmt: skip
     unknown = set(changes) - set(values)
     if unknown:

@@ -73,7 +73,7 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     give = give + rate(params.squeeze) * touch * spare
     lift = rate(params.pickup) * touch * jnp.clip(film - even, 0.0, 3.0 * radius) * area
     lift = lift * jnp.clip(2.0 - load, 0.0, 1.0)[None]
-    swap = rate(params.exchange) * touch * jnp.minimum(film, 2.0 * config.layer) * area
+    swap = rate(params.exchange) * touch * jnp.minimum(film, params.exchange_depth) * area
 
     # Where: the cells around the point, not above the film's surface.
     at = jnp.minimum(z, film) - 0.5 * config.layer
