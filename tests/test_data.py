@@ -148,6 +148,9 @@ def test_options_that_do_not_fit_are_refused():
         dataclasses.replace(SMALL, size=50)
     with pytest.raises(ValueError, match="stamps"):
         dataclasses.replace(SMALL, stamps=2)
+    for spacing in (0.0, 0.1, 0.25):
+        with pytest.raises(ValueError, match=f"PairConfig.spacing = {spacing}"):
+            dataclasses.replace(SMALL, spacing=spacing)
 
 
 def test_long_strokes_fit_their_stamps():
@@ -156,7 +159,7 @@ def test_long_strokes_fit_their_stamps():
         plan = pairs.draw(options, jax.random.key(k))
         position = np.asarray(plan.stroke.position)[np.asarray(plan.stroke.valid)]
         step = np.hypot(*np.diff(position, axis=0).T)
-        assert step.max() <= options.paint.pixel * 1.01
+        assert step.max() <= options.spacing * 1.01
         assert np.isclose(float(plan.mix.sum()), 1.0) and 0.0 < float(plan.load) <= 1.0
 
 

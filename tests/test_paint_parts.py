@@ -9,8 +9,11 @@ import pytest
 
 from jaxbrush.paint import PaintConfig, make_params
 from jaxbrush.paint.advection import advect, repack, slump
+from jaxbrush.paint.hair import Hair
 from jaxbrush.paint.solvers import Matrix, apply, diagonal, residual, solve
+from jaxbrush.paint.state import BrushPaint
 from jaxbrush.paint.stencil import near, wide
+from jaxbrush.paint.transfer import transfer
 from jaxbrush.paint.velocity import divergence, faces_of, project, viscous
 
 SIDE = 8
@@ -270,3 +273,27 @@ def test_drag_carries_paint_with_the_hair_and_the_canvas_holds_it(x64):
     middle = np.asarray(faces[0]).reshape(6, side, side)
     np.testing.assert_allclose(middle[:5, 12, 12], u[:5, 0, 12, 12], rtol=1e-3)
     assert np.all(middle[:, :, -1] == 0.0)
+
+
+def test_what_bristles_exchange_does_not_depend_on_the_layers():
+    """Four bristles, twice full so that they only exchange, in a film of 0.25 mm."""
+    params = make_params(contact_area=0.02, tip_volume=0.04)
+    place = jnp.asarray([[[0.3, 0.3, 0.7, 0.7]], [[0.3, 0.7, 0.3, 0.7]], [[0.02] * 4]])
+    ones = jnp.ones((1, 4))
+    hair = Hair(
+        place=place, motion=jnp.zeros((3, 1, 4)), weight=ones, share=jnp.ones((1, 1)),
+        travel=jnp.full(4, 0.1), volume=0.0 * ones, step=jnp.asarray(0.1),
+    )  # fmt: skip
+    gained = []
+    for layers in (2, 4, 8, 16):
+        config = PaintConfig(layers=layers, layer=0.5 / layers, window=SIDE, pigments=2)
+        full = (jnp.arange(layers) < layers // 2).astype(float)
+        paint = jnp.zeros((layers, 2, SIDE, SIDE)).at[:, 1].set(full[:, None, None])
+        brush = BrushPaint(jnp.zeros((2, 4)).at[0].set(0.02), jnp.zeros((2, 4)))
+        after, left = transfer(config, params, paint, brush, hair, jnp.zeros((SIDE, SIDE)))
+        gained.append(float(left.tip[1].sum()))
+        there = config.cell * float(paint.sum() - after.sum())
+        assert there == pytest.approx(float(left.tip.sum()) - 0.08, abs=1e-7)
+    print("taken up [mm^3]", gained)
+    assert gained[0] > 1e-5
+    np.testing.assert_allclose(gained, gained[0], rtol=1e-4)
