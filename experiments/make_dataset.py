@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Annotated, Literal
 
 import cv2
+import jax
 import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -43,7 +44,7 @@ class Config:
     shard: Annotated[str | None, tyro.conf.arg(metavar="I/N")] = None
     """Makes every N-th shard from the I-th on (from 0): one of N machines."""
     workers: int = 0
-    """Processes [default: one for each core]."""
+    """Processes [default: one for each core; a single one where there is an accelerator]."""
 
 
 def part_of(text: str | None, count: int) -> list[int]:
@@ -67,10 +68,22 @@ def cores() -> list[int]:
 
 
 def work(folder: Path, preset: str, seed: int, numbers: list[int]) -> None:
-    """What one process does: a line for each canvas that is finished."""
-    options = data.PRESETS[preset]
+    """What one process does: a line for each canvas that is finished. On an accelerator, the
+    canvases of a shard side by side."""
+    options, together = data.PRESETS[preset], jax.default_backend() != "cpu"
     for number in numbers:
-        data.make_shard(folder, options, seed, number, lambda: print("canvas", flush=True))
+        tell = lambda: print("canvas", flush=True)  # noqa: E731
+        data.make_shard(folder, options, seed, number, tell, together)
+
+
+def processes_of(wanted: int, cores: int, shards: int) -> int:
+    """How many processes make a data set: as many as are wanted, else one for each core, or a
+    single one that has the accelerator. Asked of another process, for who asks takes hold of it."""
+    if not wanted:
+        ask = [sys.executable, "-c", "import jax; print(jax.default_backend())"]
+        found = subprocess.run(ask, capture_output=True, text=True, check=False).stdout.split()
+        wanted = cores if found[-1:] == ["cpu"] else 1
+    return max(1, min(wanted, shards))
 
 
 def make(folder: Path, preset: str, seed: int, numbers: list[int], workers: int) -> None:
@@ -81,7 +94,7 @@ def make(folder: Path, preset: str, seed: int, numbers: list[int], workers: int)
     if not numbers:
         return
     own = cores()
-    workers = max(1, min(workers or len(own), len(numbers)))
+    workers = processes_of(workers, len(own), len(numbers))
     processes = []
     for k in range(workers):
         command = [sys.executable, "-m", "experiments.make_dataset", "--worker"]

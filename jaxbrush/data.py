@@ -20,7 +20,7 @@ import numpy as np
 from jaxbrush.brush import BrushConfig
 from jaxbrush.canvas import from_srgb, to_srgb
 from jaxbrush.paint import PaintConfig
-from jaxbrush.pairs import PairConfig, Picture, canvas_pairs
+from jaxbrush.pairs import PairConfig, Picture, canvas_pairs, canvases_pairs
 from jaxbrush.structs import config
 from jaxbrush.train import Batch
 
@@ -141,11 +141,13 @@ def shard_path(folder, number: int) -> Path:
     return Path(folder) / f"shard-{number:05d}.npy"
 
 
-def make_shard(folder, options: DataConfig, seed: int, number: int, done=lambda: None) -> Path:
+def make_shard(
+    folder, options: DataConfig, seed: int, number: int, done=lambda: None, together: bool = False
+) -> Path:
     """Paints the pairs of one shard and writes it; does nothing when it is there and sound.
 
     Args:
-      done: called after each canvas.
+      done: called after each canvas. together: paints all canvases of the shard side by side.
 
     Returns:
       Path of the shard.
@@ -158,9 +160,13 @@ def make_shard(folder, options: DataConfig, seed: int, number: int, done=lambda:
         except DataError:
             path.with_suffix(".json").unlink()
     planes, missed = [], 0
-    for canvas in range(number * options.shard, (number + 1) * options.shard):
-        canvas = canvas if canvas < options.train else TESTS + canvas - options.train
-        for picture in canvas_pairs(options.pairs, seed, canvas):
+    canvases = range(number * options.shard, (number + 1) * options.shard)
+    canvases = [c if c < options.train else TESTS + c - options.train for c in canvases]
+    painted = (canvas_pairs(options.pairs, seed, canvas) for canvas in canvases)
+    if together:
+        painted = canvases_pairs(options.pairs, seed, canvases)
+    for canvas, pictures in zip(canvases, painted, strict=True):
+        for picture in pictures:
             if not np.all(np.isfinite(picture.new_height)):
                 raise FloatingPointError(f"canvas {canvas}, seed {seed}: not finite")
             missed += not picture.reached
@@ -214,14 +220,18 @@ class Dataset:
         """Pairs by number as float32, (n, h, w, channels): height in mm, colors in sRGB."""
         each = len(self.planes[split][0])
         index = np.asarray(index)
-        raw = np.stack([self.planes[split][i // each][i % each] for i in index])
-        out, at = {}, 0
-        for name, count in CHANNELS:
-            level = LEVELS.get(name.removeprefix("new_"), 1.0)
-            value = np.moveaxis(raw[:, at : at + count], 1, -1)
-            out[name] = value.astype(np.float32) * np.float32(level / FULL)
-            at += count
-        return out
+        return _unpack(np.stack([self.planes[split][i // each][i % each] for i in index]))
+
+
+def _unpack(planes) -> dict[str, np.ndarray]:
+    """Named float32 maps (n, h, w, channels) of packed pairs (n, channels, h, w)."""
+    out, at = {}, 0
+    for name, count in CHANNELS:
+        level = LEVELS.get(name.removeprefix("new_"), 1.0)
+        value = np.moveaxis(planes[:, at : at + count], 1, -1)
+        out[name] = value.astype(np.float32) * np.float32(level / FULL)
+        at += count
+    return out
 
 
 def _config(values: dict) -> DataConfig:

@@ -262,6 +262,13 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
 
 
 _paint_pair = jax.jit(paint_pair)
+_paint_pairs = jax.jit(jax.vmap(paint_pair, in_axes=(None, 0, 0, 0, None)))
+
+
+def _begun(options: PairConfig, seed: int, number: int):
+    """Key and palette of a canvas."""
+    key = jax.random.fold_in(jax.random.key(seed), number)
+    return key, draw_palette(jax.random.fold_in(key, 0), options.paint.pigments)
 
 
 def canvas_pairs(options: PairConfig, seed: int, number: int):
@@ -273,8 +280,7 @@ def canvas_pairs(options: PairConfig, seed: int, number: int):
     Returns:
       list of `strokes` Pictures, numpy arrays.
     """
-    key = jax.random.fold_in(jax.random.key(seed), number)
-    palette = draw_palette(jax.random.fold_in(key, 0), options.paint.pigments)
+    key, palette = _begun(options, seed, number)
     shape = (options.size + 2 * MARGIN,) * 2
     tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
     canvas, pictures = empty_canvas(options.paint, shape), []
@@ -283,3 +289,19 @@ def canvas_pairs(options: PairConfig, seed: int, number: int):
         canvas, picture = _paint_pair(options, plan, palette, canvas, tooth)
         pictures.append(jax.tree.map(np.asarray, picture))
     return pictures
+
+
+def canvases_pairs(options: PairConfig, seed: int, numbers):
+    """`canvas_pairs` of several canvases, a list for each, painted side by side: for a GPU, which
+    one canvas does not fill. The same but for rounding, which moves single grooves."""
+    keys, palettes = zip(*(_begun(options, seed, n) for n in numbers), strict=True)
+    shape = (options.size + 2 * MARGIN,) * 2
+    tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
+    stacked = lambda trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)  # noqa: E731
+    canvas, palette = stacked([empty_canvas(options.paint, shape)] * len(keys)), stacked(palettes)
+    strokes = []
+    for stroke in range(options.strokes):
+        plans = stacked([draw(options, jax.random.fold_in(key, stroke + 1)) for key in keys])
+        canvas, picture = _paint_pairs(options, plans, palette, canvas, tooth)
+        strokes.append(jax.device_get(picture))
+    return [[jax.tree.map(lambda x, k=k: x[k], p) for p in strokes] for k in range(len(keys))]

@@ -2,13 +2,14 @@
 
 import dataclasses
 import json
+import types
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluate, train_network
+from experiments import evaluate, make_dataset, train_network
 from jaxbrush import checkpoint, data, pairs
 from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
@@ -48,6 +49,34 @@ def test_a_pair_depends_on_its_seed_and_number_only(folder):
         np.testing.assert_allclose(np.squeeze(stored[name]), want, atol=0.51 * level / data.FULL)
     other = pairs.canvas_pairs(SMALL, SEED + 1, 1)[1]
     assert np.abs(other.new_height - alone.new_height).max() > 0.02
+
+
+def test_canvases_side_by_side_are_the_same_pairs(folder, tmp_path):
+    """As a GPU makes them: the same maps and as much paint. Single grooves differ, as they do where
+    a stroke is shifted by a nanometre."""
+    apart = dataclasses.replace(OPTIONS, shard=2, test=2)
+    path = data.start(tmp_path, apart, SEED)
+    data.make_shard(path, apart, SEED, 0, together=True)
+    found = data._unpack(np.load(data.shard_path(path, 0)))
+    alone = data._unpack(np.concatenate([np.load(data.shard_path(folder, n)) for n in range(2)]))
+    assert len(found["height"]) == 4
+    for name in ("pressure", "sweeps", "trajectory", "time", "load", "mask"):
+        # A hair may leave a pixel's border on the other side.
+        assert np.mean(found[name] != alone[name]) < 2e-3, name
+    for name in ("new_height", "new_color"):
+        sums = [x[name].sum((1, 2, 3), dtype=np.float64) for x in (found, alone)]
+        np.testing.assert_allclose(*sums, rtol=0.02, err_msg=name)
+    apart = np.sqrt(np.mean((found["new_height"] - alone["new_height"]) ** 2))
+    print("rms difference of heights [um]", 1e3 * apart)
+    assert apart < 0.1 * np.sqrt(np.mean(alone["new_height"] ** 2))
+
+
+def test_as_many_processes_as_cores_or_one_for_the_accelerator(monkeypatch):
+    answer = lambda name: types.SimpleNamespace(stdout=f"a warning\n{name}\n")  # noqa: E731
+    monkeypatch.setattr(make_dataset.subprocess, "run", lambda *_, **__: answer("cpu"))
+    assert make_dataset.processes_of(0, 8, 100) == 8 and make_dataset.processes_of(0, 8, 3) == 3
+    monkeypatch.setattr(make_dataset.subprocess, "run", lambda *_, **__: answer("gpu"))
+    assert make_dataset.processes_of(0, 8, 100) == 1 and make_dataset.processes_of(2, 8, 100) == 2
 
 
 def test_a_stroke_changes_its_mask_and_is_the_next_background(folder):
