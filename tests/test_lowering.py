@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from jax import export
 
-from jaxbrush import painter, stages
+from jaxbrush import painter, pairs, stages
 from jaxbrush.brush import BrushConfig, make_brush, rollout
 from jaxbrush.brush.shapes import INTEGRATORS
 from jaxbrush.canvas import blank
@@ -88,6 +88,17 @@ def test_heightfield():
     loaded = load_brush(config, make_params(), 6, 0.8, jnp.asarray([1.0, 0.0]))
     run = functools.partial(heightfield_stroke, config)
     assert not lowers(run, make_params(), empty_canvas(config, (24, 64)), loaded, moved())
+
+
+def test_pairs_side_by_side():
+    grid = PaintConfig(layers=4, window=16, pigments=2, viscous=2, pressure=2)
+    options = pairs.PairConfig(size=16, stamps=8, bristles=6, paint=grid)
+    plans = [pairs.draw(options, key) for key in jax.random.split(jax.random.key(0))]
+    shape = (options.size + 2 * pairs.MARGIN,) * 2
+    both = lambda x: jnp.stack([x, x])  # noqa: E731
+    run = functools.partial(jax.vmap(pairs.paint_pair, in_axes=(None, 0, 0, 0, None)), options)
+    given = jax.tree.map(lambda *x: jnp.stack(x), *plans), both(jnp.ones((2, 3)))
+    assert not lowers(run, *given, both(empty_canvas(grid, shape)), jnp.zeros(shape))
 
 
 def variables(config, inputs):
