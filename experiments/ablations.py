@@ -17,6 +17,7 @@ from typing import Annotated, Literal
 
 import matplotlib.pyplot as plt
 import tyro
+from matplotlib.ticker import LogLocator, NullFormatter
 
 from experiments import evaluate, train_network
 from experiments.common import (
@@ -123,7 +124,10 @@ def chart(kind: str, rows: list[dict], path: Path):
         axis.annotate(row["name"], (row["ms"], row["masked"]), xytext=(6, 0), color=INK,
                       textcoords="offset points", va="center", fontsize=8)  # fmt: skip
     axis.set_xscale("log")
-    axis.margins(x=0.25)
+    axis.margins(x=0.3)
+    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    axis.xaxis.set_major_formatter("{x:g}")
+    axis.xaxis.set_minor_formatter(NullFormatter())
     axis.set_xlabel(f"time to paint {SIDE} x {SIDE} pixels [ms]")
     axis.set_ylabel("RMSE in the mask, network scale")
     axis.set_title(f"{kind}: what each part is worth; the band is another seed")
