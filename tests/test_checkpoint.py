@@ -1,4 +1,5 @@
 import dataclasses
+import gc
 import json
 import resource
 import shutil
@@ -97,6 +98,8 @@ def test_unfinished_and_damaged_checkpoints_leave_the_one_before(tmp_path, initi
             checkpoint.restore(checkpoints, abstract)
 
 
+# Orbax drops the writes it had not begun when one fails.
+@pytest.mark.filterwarnings("ignore:coroutine .* was never awaited:RuntimeWarning")
 def test_full_disk_leaves_the_checkpoint_before(tmp_path, initial, abstract):
     """A limit on the size of files makes every larger write fail, as a full disk does."""
     with checkpoint.opened(tmp_path, OPTIONS) as checkpoints:
@@ -112,6 +115,7 @@ def test_full_disk_leaves_the_checkpoint_before(tmp_path, initial, abstract):
     finally:
         resource.setrlimit(resource.RLIMIT_FSIZE, limits)
         signal.signal(signal.SIGXFSZ, handler)
+        gc.collect()  # here, and not in the middle of another test
     with checkpoint.opened(tmp_path, OPTIONS) as checkpoints:
         found = checkpoint.restore(checkpoints, abstract)
     same(found.state, at(initial, 2))
