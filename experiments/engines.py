@@ -29,13 +29,14 @@ from jaxbrush.paint import (
     presets,
     weave,
 )
+from jaxbrush.pairs import LOAD
 from jaxbrush.raster.grid import bucket
 from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent, to_stroke
 from jaxbrush.session import Session as Live
 from jaxbrush.stylus import Stroke, resample, stamps_needed
 
 BRUSH = {
-    "shape": "flat", "width": 3.0, "thickness": 0.9, "length": 15.0, "depth": 3.75, "load": 0.85,
+    "shape": "flat", "width": 3.0, "thickness": 0.9, "length": 15.0, "depth": 3.75, "load": LOAD,
     "bristles": 128, "seed": 0,
 }  # fmt: skip
 """The brush of a session that names none; what a brush event may say. width, thickness, length of
