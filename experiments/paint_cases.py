@@ -25,7 +25,7 @@ from jaxbrush.paint import (
 )
 from jaxbrush.stylus import make_stroke, resample
 
-FINE = 1.0 / 32.0  # [mm] between stamps of the track
+FINE = 1.0 / 64.0  # [mm] between stamps of the track
 GRID = 0.125  # [mm], pixels on which results are compared
 HEIGHT, WIDTH = 8.0, 18.0  # [mm] of the canvas
 BAND, DEEP = (5.0, 8.0), 0.25  # [mm] where along x another color lies, and how thick

@@ -11,6 +11,8 @@ from jaxbrush.paint.state import PaintConfig, PaintParams, relaxation
 from jaxbrush.paint.stencil import inner_x, inner_y, near, wide
 
 TINY = 1e-9
+LOOSE = 0.09375
+"""Depth of the paint that slumps from a column at once, at most [mm]."""
 SLOP = 1e-5
 """Excess or lack of a cell that is left alone, share of a cell."""
 
@@ -153,10 +155,10 @@ def slump(config: PaintConfig, params: PaintParams, paint, hairy, step):
     at = lambda planes, shift=0: near(planes, width, shift)[0]  # noqa: E731
 
     def down(carry, cell):
-        # The paint that can move: the topmost cells of a column, 1.5 deep.
+        # The paint that can move: the uppermost of a column.
         above, column = carry
         fill = jnp.sum(cell, axis=0)
-        loose = jnp.clip(1.5 - above, 0.0, fill) / jnp.maximum(fill, TINY)
+        loose = jnp.clip(LOOSE / config.layer - above, 0.0, fill) / jnp.maximum(fill, TINY)
         return (above + fill, column + cell * loose[None]), loose
 
     start = (jnp.zeros_like(paint[0, 0]), jnp.zeros_like(paint[0]))
@@ -181,8 +183,13 @@ def slump(config: PaintConfig, params: PaintParams, paint, hairy, step):
         lost = lost + (jnp.maximum(ahead, 0.0) + jnp.maximum(-behind, 0.0)) * scale
         gained = gained + (jnp.maximum(behind, 0.0) * at(by, -shift))[None] * at(column, -shift)
         gained = gained + (jnp.maximum(-ahead, 0.0) * at(by, shift))[None] * at(column, shift)
-    top = jnp.clip(jnp.floor(height), 0.0, paint.shape[0] - 1.0)
-    level = jnp.arange(paint.shape[0], dtype=paint.dtype)[:, None]
-    landing = (level == top[None]).astype(paint.dtype)
     lost, gained = lost / one, gained / one
+    # It lands on the surface: what the topmost cell has room for, and the rest above.
+    level = jnp.arange(paint.shape[0], dtype=paint.dtype)[:, None]
+    amount = jnp.sum(gained, axis=0)
+    raised = jnp.clip((height + amount)[None] - level, 0.0, 1.0)
+    raised = raised.at[-1].add(jnp.maximum(height + amount - paint.shape[0], 0.0))
+    full = jnp.clip(height[None] - level, 0.0, 1.0)
+    full = full.at[-1].add(jnp.maximum(height - paint.shape[0], 0.0))
+    landing = (raised - full) / jnp.maximum(amount, TINY)[None]
     return paint * (1.0 - loose * lost[None])[:, None] + gained[None] * landing[:, None]

@@ -22,7 +22,7 @@ from jaxbrush.paint.rollout import paint_stroke
 from jaxbrush.paint.solvers import Matrix, residual, solve
 from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams, relaxation
 from jaxbrush.paint.stencil import inner_x, inner_y, near, stored, wide
-from jaxbrush.paint.transfer import refill, ride, transfer
+from jaxbrush.paint.transfer import columns, refill, ride, transfer
 from jaxbrush.paint.velocity import stop
 
 STIRRED = 0.06
@@ -37,7 +37,7 @@ THIN = 1e-4
 
 def heightfield_config(**changes) -> PaintConfig:
     """The settings of the height field; `changes` by name."""
-    values = dict(layers=2, layer=1.0, samples=3, sweeps=1, viscous=4, pressure=8)
+    values = dict(layers=2, layer=1.0, samples=3, viscous=4, pressure=8, spectrum=0.9)
     return PaintConfig(**(values | changes))
 
 
@@ -187,9 +187,7 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
 
     # Exchange is with the upper film, so heights count from the lower one.
     under = jnp.sum(paint[0], axis=0)
-    place = jnp.round(points.place[:2] / config.pixel - 0.5).astype(jnp.int32)
-    place = jnp.clip(place, 0, size - 1)
-    raised = points.place.at[2].set(z - under.reshape(size, size)[place[1], place[0]])
+    raised = points.place.at[2].set(z - columns(config, under.reshape(size, size), points.place))
     top, brush = transfer(
         config,
         dataclasses.replace(params, compliance=0.0 * params.compliance),

@@ -41,7 +41,7 @@ def realtime(bristles: int = REAL // 2) -> tuple[PaintConfig, PaintParams, float
     """
     config = PaintConfig(
         pixel=0.25, layer=0.2, layers=5, window=24, samples=2, sweeps=1, viscous=2, pressure=3,
-        limiter=False,
+        spectrum=0.9, limiter=False,
     )  # fmt: skip
     return config, params_of(bristles), 0.25
 
@@ -50,6 +50,7 @@ def reference(bristles: int = REAL) -> tuple[PaintConfig, PaintParams, float]:
     """Finer than any use, to measure convergence by: cells half as high, a quarter of a pixel
     between stamps, solvers that leave 0.4 % (viscous) and 1e-5 (pressure)."""
     config = PaintConfig(
-        layer=0.03125, layers=32, viscous=24, solver="zline_pcg", pressure=40, spectrum=0.97
-    )
-    return config, params_of(bristles), 0.03125
+        layer=0.03125, layers=32, samples=16, viscous=24, solver="zline_pcg", pressure=40,
+        spectrum=0.97,
+    )  # fmt: skip
+    return config, params_of(bristles), 0.015625

@@ -48,7 +48,7 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
     z, _ = ride(config, params, paint, points)
     phi, motion = stored(splat(config, points, z), one)
     paint = paint.reshape(*shape[:2], -1)
-    hairy = (jnp.sum(phi, axis=0) > 0.0).astype(paint.dtype).reshape(shape[2:])
+    hairy = jnp.minimum(jnp.sum(phi, axis=0) / 0.02, 1.0).reshape(shape[2:])
     paint = slump(config, params, paint, _near(hairy, 2).reshape(-1), points.step)
     paint = stored(paint, one)
     fill = stored(jnp.sum(paint, axis=1), one)

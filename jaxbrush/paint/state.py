@@ -29,13 +29,13 @@ class PaintConfig:
     layers: int = 16
     window: int = 64
     pigments: int = 4
-    samples: int = 4
-    sweeps: int = 2
+    samples: int = 8
+    sweeps: int = 1
     across: int = 1
-    viscous: int = 6
-    pressure: int = 10
+    viscous: int = 9
+    pressure: int = 20
     solver: str = "chebyshev"
-    spectrum: float = 0.9
+    spectrum: float = 0.95
     limiter: bool = True
 
     def __post_init__(self):

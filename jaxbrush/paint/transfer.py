@@ -18,18 +18,23 @@ def _rate(k, travel):
     return 1.0 - jnp.exp(-k * travel)
 
 
-def _columns(config, field, place):
-    """Values of (y, x) under points (2, s, b), the nearest column."""
+def columns(config: PaintConfig, field, place):
+    """Values of (y, x) under points (2, s, b), linear between the middles of columns."""
     h, w = field.shape
-    i = jnp.clip(jnp.round(place[0] / config.pixel - 0.5).astype(jnp.int32), 0, w - 1)
-    j = jnp.clip(jnp.round(place[1] / config.pixel - 0.5).astype(jnp.int32), 0, h - 1)
-    return field[j, i]
+    at = [jnp.clip(place[k] / config.pixel - 0.5, 0.0, n - 1.0) for k, n in ((1, h), (0, w))]
+    low = [jnp.minimum(jnp.floor(a), n - 2.0) for a, n in zip(at, (h, w), strict=True)]
+    y, x = (a - b for a, b in zip(at, low, strict=True))
+    j, i = (b.astype(jnp.int32) for b in low)
+    flat, first = field.reshape(-1), j * w + i
+    upper = (1.0 - x) * flat[first] + x * flat[first + 1]
+    lower = (1.0 - x) * flat[first + w] + x * flat[first + w + 1]
+    return (1.0 - y) * upper + y * lower
 
 
 def ride(config: PaintConfig, params: PaintParams, paint, hair: Hair):
     """Heights of the hair (s, b) [mm] after it rode up on thick paint; and the film under it."""
     film = config.layer * jnp.sum(paint, axis=(0, 1))
-    under = _columns(config, film, hair.place)
+    under = columns(config, film, hair.place)
     height = jnp.maximum(hair.place[2], 0.0)
     return height + params.compliance * jnp.maximum(under - height, 0.0), under
 
@@ -55,7 +60,7 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     coat = radius * (params.coat_dry + params.coat_full * jnp.minimum(load, 1.3))
 
     z, film = ride(config, params, paint, hair)
-    above = jnp.maximum(z - _columns(config, tooth, hair.place), 0.0)
+    above = jnp.maximum(z - columns(config, tooth, hair.place), 0.0)
     reach = (radius + coat)[None]
     touch = jnp.clip((reach - (above - film)) / reach, 0.0, 1.0) * hair.weight
     even = jnp.maximum(above + 0.7 * coat[None] - radius, 0.0)

@@ -116,21 +116,35 @@ def pressure_system(config: PaintConfig, params: PaintParams, fill, phi, face):
 
     # What a liquid cell adds for its neighbours of air.
     here, extra = near(wet, width), 0.0
+    full = wide(fill + phi, width)
     for sign in (-1, 1):
         walls = _walls(width, min(sign, 0))
         for shift, wall in zip((1, width), walls, strict=True):
             air = 1.0 - near(wet, width, sign * shift)
+            air = air / _reach(near(full, width), near(full, width, sign * shift))
             extra = extra + jnp.asarray(wall, fill.dtype)[None] * air
     above, below = near(wet, width, 0, 1), near(wet, width, 0, -1)
     top = jnp.ones((config.layers, 1), fill.dtype).at[-1].set(0.0)
     bottom = jnp.ones((config.layers, 1), fill.dtype).at[0].set(0.0)
-    open_ = top * (1.0 - above) * near(lid, width) + bottom * (1.0 - below) * near(
-        lid, width, 0, -1
-    )
+    up = (1.0 - above) * near(lid, width)
+    up = up / _reach(near(full, width), near(full, width, 0, 1))
+    down = (1.0 - below) * near(lid, width, 0, -1)
+    down = down / _reach(near(full, width), near(full, width, 0, -1))
+    open_ = top * up + bottom * down
     extra = jnp.where(here > 0.0, extra + config.ratio * open_, 1.0)
     matrix = Matrix(wet, jnp.maximum(extra, 1e-6) / one, config.ratio, width)
     rhs = (liquid * (source - divergence(face, width)))[:, None] / one
     return matrix, rhs, lid
+
+
+NEAREST = 0.1
+"""Share of a cell that the surface is away from a cell's middle at least."""
+
+
+def _reach(here, there):
+    """How far from the middle of a liquid cell the surface is on the way to one of air, where the
+    fill falls to a half in between [cells]: pressure is 0 there (ghost fluid)."""
+    return jnp.clip((here - 0.5) / jnp.maximum(here - there, 1e-3), NEAREST, 1.0)
 
 
 def _walls(width: int, step: int = 0):
@@ -157,15 +171,24 @@ def project(config: PaintConfig, params: PaintParams, fill, phi, face):
     left = residual(matrix, p[..., width:-width], rhs)
     p = jnp.pad(p[:, 0], ((1, 1), (0, 0)))
 
-    wet, moved = matrix.link, []
+    wet, moved, full = matrix.link, [], wide(fill + phi, width)
     here, above = near(wet, width), near(wet, width, 0, 1)
+    level = near(full, width)
+
+    def away(there, shift, layer=0):
+        """1 over the distance to the surface, of whichever side of the face is liquid."""
+        beyond = near(full, width, shift, layer)
+        reach = jnp.where(here > 0.0, _reach(level, beyond), _reach(beyond, level))
+        return jnp.where(here * there > 0.0, 1.0, 1.0 / reach)
+
     for f, shift, wall in zip(face[:2], (1, width), _walls(width), strict=True):
         weight = jnp.maximum(here, near(wet, width, shift))
-        weight = weight * jnp.asarray(wall, fill.dtype)[None]
+        weight = weight * jnp.asarray(wall, fill.dtype)[None] * away(near(wet, width, shift), shift)
         drop = near(p, width, shift) - near(p, width)
         moved.append(near(f, width) - weight * drop)
     top = jnp.ones((config.layers, 1), fill.dtype).at[-1].set(0.0)
     weight = jnp.maximum(here * above, jnp.maximum(here, above) * near(lid, width)) * top
+    weight = weight * away(above, 0, 1)
     drop = near(p, width, 0, 1) - near(p, width)
     moved.append(near(face[2], width) - config.ratio * weight * drop)
     return moved, left
