@@ -45,11 +45,15 @@ _BOTH = {
 VARIANTS = {
     "height": _BOTH | {
         "no load": {"load": False},
+        "no height of the tips": {"tip": False},
         "no sweep count": {"hand": "pressure"},
         "no pressure": {"hand": "sweeps"},
-        "the paper's maps": {"hand": "pressure", "time": False, "load": False},
+        "the paper's maps": {"hand": "pressure", "time": False, "load": False, "tip": False},
     },
-    "color": _BOTH | {"no new height": {"height": False}, "no recoloring": {"recolor": False}},
+    "color": _BOTH | {
+        "no new height": {"height": False}, "no recoloring": {"recolor": False},
+        "a color, not shares": {"mixes": False},
+    },
 }  # fmt: skip
 """What each changes of the default."""
 

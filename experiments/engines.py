@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from jaxbrush import data, painter
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
-from jaxbrush.canvas import Canvas, blank, flatten
+from jaxbrush.canvas import Canvas, absorbed, blank, flatten
 from jaxbrush.paint import (
     PaintConfig,
     PaintParams,
@@ -43,8 +43,6 @@ BRUSH = {
 the ferrule and hair, depth at full pressure [mm]."""
 COLORS = ((0.02, 0.06, 0.30), (0.80, 0.16, 0.02), (0.85, 0.55, 0.04), (0.02, 0.25, 0.10))
 """Taken in turn by strokes of a session that names no color, linear RGB."""
-EXPONENT = 0.35
-"""Of the mixture that `canvas.mix_subtractive` makes."""
 PIXEL = PaintConfig().pixel
 
 
@@ -104,16 +102,15 @@ def deeds_of(session: Session, shape) -> list[Deed]:
     return found
 
 
-def _ratio(rgb):
-    reflectance = np.clip(np.asarray(rgb, float), 1e-3, 0.999)
-    return ((1.0 - reflectance) ** 2 / (2.0 * reflectance)) ** EXPONENT
+def _absorbed(rgb) -> np.ndarray:
+    return np.asarray(absorbed(jnp.asarray(rgb, float)), float)
 
 
 def shares(rgb, palette) -> np.ndarray:
     """Shares of pigments (k, 3) whose subtractive mixture comes nearest to a color."""
     # A heavy last row makes the shares sum to 1.
-    left = np.vstack([_ratio(palette).T, np.full(len(palette), 1e3)])
-    found, _ = nnls(left, np.append(_ratio(rgb), 1e3))
+    left = np.vstack([_absorbed(palette).T, np.full(len(palette), 1e3)])
+    found, _ = nnls(left, np.append(_absorbed(rgb), 1e3))
     return found / found.sum()
 
 
@@ -121,7 +118,7 @@ def palette_of(deeds, most: int = 6) -> np.ndarray:
     """Pigments that the colors of all deeds can be mixed from, (k, 3): the colors farthest from
     each other, by absorption."""
     colors = np.unique(np.asarray([d.color for d in deeds]), axis=0)
-    place = _ratio(colors)
+    place = _absorbed(colors)
     chosen = [int(np.argmax(np.linalg.norm(place - place.mean(0), axis=1)))]
     while len(chosen) < min(most, len(colors)):
         away = np.min(np.linalg.norm(place[:, None] - place[None, chosen], axis=-1), axis=1)

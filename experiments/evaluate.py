@@ -18,7 +18,7 @@ import tyro
 from experiments import evaluation, make_dataset, train_network, training
 from experiments.common import print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
-from jaxbrush import checkpoint, data
+from jaxbrush import batches, checkpoint, data
 from jaxbrush.models import Generator
 
 KINDS = {1: "height", 3: "color"}
@@ -80,7 +80,7 @@ def main(options: Config) -> None:
         raise SystemExit(f"{error}") from error
     folder = results_folder("evaluate", options.out)
     index = np.arange(found.count(options.split))
-    scale = Scale(data.LEVELS["height"], found.options.pairs.paint.pixel)
+    scale = Scale(batches.LEVELS["height"], found.options.pairs.paint.pixel)
     results = {}
     for path, exported in networks:
         kind = KINDS[exported.config.outputs]
@@ -92,7 +92,7 @@ def main(options: Config) -> None:
             raise SystemExit(f"{path}: {error}") from error
         if kind == "color" and chained and seen.height:
             laid = train_network.predicted_heights(found, options.split, index, chained)
-            used = with_height(pairs, data.network_height(laid))
+            used = with_height(pairs, batches.network_height(laid))
             picture = predicted(exported, used)
             rows = {
                 "on predicted height": evaluation.errors(kind, picture, used.batch, scale)

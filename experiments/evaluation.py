@@ -9,7 +9,7 @@ import numpy as np
 
 from jaxbrush import metrics
 from jaxbrush.canvas import from_srgb
-from jaxbrush.models import Generator, GeneratorConfig
+from jaxbrush.models import Generator, GeneratorConfig, inputs_of
 from jaxbrush.train import Batch, weights_of
 
 TOGETHER = 4  # pairs evaluated at once
@@ -154,7 +154,7 @@ def paint(options: GeneratorConfig, variables: dict, batch: Batch) -> np.ndarray
     Raises:
       ValueError: a network of other inputs.
     """
-    have, given = variables["params"]["encode1"]["kernel"].shape[2], batch.inputs.shape[-1]
+    have, given = inputs_of(options, variables["params"]), batch.inputs.shape[-1]
     if have != given:
         raise ValueError(f"a network of {have} inputs: expected {given}, one for each map given")
     out = []

@@ -18,7 +18,7 @@ PALETTE = {
 """Pigments, linear RGB."""
 NAMES = tuple(PALETTE)
 BRISTLES = 260
-STAMPS = 320
+STAMPS = 640
 SPEED = 60.0
 """Stamps a stroke is padded to; speed of the hand [mm/s]."""
 # shape, width, thickness, length [mm]
@@ -41,15 +41,15 @@ class Touch:
     fall: float = 0.15
 
 
-def hand(corners, pressure: float, pixel: float, depth: float, fall: float = 0.15) -> Stroke:
-    """A stroke through rounded corners, stamps a pixel of the handle's way apart, pressed and
-    lifted at its ends.
+def hand(corners, pressure: float, spacing: float, depth: float, fall: float = 0.15) -> Stroke:
+    """A stroke through rounded corners, stamps `spacing` [mm] of the handle's way apart, pressed
+    and lifted at its ends.
 
     Args:
       corners: (n, 2) [mm]. depth: way of the handle at pressure 1 [mm]. fall: share of the stroke
         over which it is lifted.
     """
-    return resample(drawn(corners, pressure, fall), STAMPS, pixel, np.inf, depth)
+    return resample(drawn(corners, pressure, fall), STAMPS, spacing, np.inf, depth)
 
 
 def drawn(corners, pressure: float, fall: float = 0.15) -> Stroke:

@@ -20,8 +20,8 @@ from rich.progress import track
 from experiments import engines, paint_scenes
 from experiments.common import console, print_table, results_folder, write_run
 from jaxbrush import recordings
+from jaxbrush.batches import LEVELS
 from jaxbrush.canvas import Canvas, to_srgb
-from jaxbrush.data import LEVELS
 from jaxbrush.paint import weave
 from jaxbrush.render import picture, shade
 

@@ -28,6 +28,7 @@ from jaxbrush.paint import (
     height,
     load_brush,
     paint_stroke,
+    presets,
     weave,
 )
 from jaxbrush.render import picture, shade
@@ -60,8 +61,8 @@ def total(config: PaintConfig, canvas, brush) -> float:
     return config.cell * float(np.asarray(canvas).sum(dtype=np.float64)) + held(brush)
 
 
-def paint(config: PaintConfig, touches, say: str):
-    """Paints strokes one after the other.
+def paint(config: PaintConfig, spacing: float, touches, say: str):
+    """Paints strokes one after the other, stamps `spacing` apart [mm].
 
     Returns:
       (canvas, list of numbers of each stroke).
@@ -72,7 +73,7 @@ def paint(config: PaintConfig, touches, say: str):
     canvas, rows = empty_canvas(config, SHAPE), []
     for touch in track(touches, say, console=console):
         brush, params, depth = brush_of(touch.brush, brush_config)
-        stroke = hand(touch.corners, touch.pressure, config.pixel, depth, touch.fall)
+        stroke = hand(touch.corners, touch.pressure, spacing, depth, touch.fall)
         bristles = move(brush_config, brush, stroke)
         mix = jnp.asarray([touch.color.get(name, 0.0) for name in NAMES])
         full = load_brush(config, params, BRISTLES, touch.load, mix)
@@ -107,13 +108,14 @@ def render(config: PaintConfig, canvas, shape, scale: int) -> np.ndarray:
 
 def main(options: Config) -> None:
     folder = results_folder("show_paint", options.out)
-    config = dataclasses.replace(PaintConfig(), pigments=len(PALETTE))
+    config, _, spacing = presets.offline()
+    config = dataclasses.replace(config, pigments=len(PALETTE))
     table, numbers = [], {}
     for name, (shape, touches) in SCENES.items():
         if options.only not in (None, name) or (options.quick and name != "strokes"):
             continue
         touches = touches()[: 4 if options.quick else None]
-        canvas, rows = paint(config, touches, name)
+        canvas, rows = paint(config, spacing, touches, name)
         # Written under another name first, so that no half picture is left behind.
         cv2.imwrite(str(folder / "partial.png"), render(config, canvas, shape, options.scale))
         os.replace(folder / "partial.png", folder / f"{name}.png")

@@ -11,11 +11,15 @@ import numpy as np
 from experiments import evaluation, make_dataset, training
 from experiments.common import console
 from experiments.evaluation import Pairs, Scale
-from jaxbrush import checkpoint, data, stages
+from jaxbrush import batches, checkpoint, data, stages
 
 HELD = 5
 """Canvases of the training split, at most, that choose the best checkpoint and are not learned
 from; the test split is seen once, at the end."""
+
+
+INPUTS = ("hand", "time", "load", "tip", "height", "mixes")
+"""Options that say what a network is given."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +37,8 @@ class Config(training.Options):
     """With the time map (paper Figure 4)."""
     load: bool = True
     """Height: with the load of the brush."""
+    tip: bool = True
+    """Height: with the height of the bristles' tips."""
     height: bool = True
     """Color: with the new height (paper Figure 5)."""
     laid: Path | None = None
@@ -71,16 +77,18 @@ class Stored:
 def batch_of(raw: dict, kind: str, options: Config):
     """Inputs, target and mask of a network, as the options ask for."""
     if kind == "height":
-        return data.height_batch(raw, options.hand, options.time, options.load)
-    return data.color_batch(raw, options.time, options.height)
+        return batches.height_batch(raw, options.hand, options.time, options.load, options.tip)
+    return batches.color_batch(raw, options.time, options.height, options.mixes)
 
 
 def pairs_of(found: data.Dataset, split: str, index, kind: str, options: Config) -> Pairs:
     """Pairs of a data set in network scale."""
     raw = found.take(split, index)
-    shown = data.preview(raw)
+    shown = batches.preview(raw)
     height = kind == "height"
-    preview = data.network_height(shown["new_height"]) if height else 2.0 * shown["new_color"] - 1.0
+    preview = (
+        batches.network_height(shown["new_height"]) if height else 2.0 * shown["new_color"] - 1.0
+    )
     return Pairs(batch_of(raw, kind, options), preview)
 
 
@@ -92,9 +100,9 @@ def predicted_heights(found: data.Dataset, split: str, index, exported) -> np.nd
     given = Config(**exported.card.get("inputs", {}))
     pairs = pairs_of(found, split, index, "height", given)
     picture = evaluation.paint(exported.config, exported.variables, pairs.batch)
-    laid = data.LEVELS["height"] * 0.5 * (picture + 1.0)
+    laid = batches.LEVELS["height"] * 0.5 * (picture + 1.0)
     raw = found.take(split, index)
-    share = np.asarray(_faded(data.touched(raw)[..., 0].astype(np.float32)))[..., None]
+    share = np.asarray(_faded(batches.touched(raw)[..., 0].astype(np.float32)))[..., None]
     return (raw["height"] + share * (laid - raw["height"])).astype(np.float32)
 
 
@@ -130,7 +138,7 @@ def main(kind: str, options: Config) -> dict:
     about = (
         f"{options.preset}, seed {found.seed}: {len(numbers)} + {tests} pairs of {size} x {size}"
     )
-    scale = Scale(data.LEVELS["height"], found.options.pairs.paint.pixel)
+    scale = Scale(batches.LEVELS["height"], found.options.pairs.paint.pixel)
     try:
         result = training.fit(
             options,
@@ -140,7 +148,7 @@ def main(kind: str, options: Config) -> dict:
             take("test", np.arange(tests)),
             scale,
             data=about,
-            inputs={name: getattr(options, name) for name in ("hand", "time", "load", "height")},
+            inputs={name: getattr(options, name) for name in INPUTS},
             command=f"python -m experiments.train_{kind} {' '.join(sys.argv[1:])}".strip(),
         )
     except (ValueError, training.NotFinite) as error:

@@ -18,8 +18,8 @@ from experiments import evaluation
 from experiments.common import console, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import checkpoint
-from jaxbrush.data import recolored
-from jaxbrush.models import DiscriminatorConfig, GeneratorConfig, folded
+from jaxbrush.batches import recolored
+from jaxbrush.models import DiscriminatorConfig, GeneratorConfig, folded, inputs_of
 from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
 
 OUTPUTS = {"height": 1, "color": 3}
@@ -73,8 +73,11 @@ class Options:
     """Updates between lines of metrics.jsonl; each is a mean over them."""
     turns: bool = True
     """Mirrors and turns pairs at random, by quarters."""
+    mixes: bool = True
+    """Color: the network says how much of which paint is seen, in place of a color as the paper's
+    does."""
     recolor: bool = True
-    """Color: changes the colors of every pair at random, as paint allows (`data.recolored`)."""
+    """Color: changes the colors of every pair at random, as paint allows (`batches.recolored`)."""
     resident: float = 4.0
     """Training pairs of up to so many GB are kept on the device, more are streamed."""
     seed: int = 0
@@ -95,6 +98,11 @@ def falling(fall: float, spent: float) -> float:
     return float(np.clip((1.0 - rung) / max(fall, 1e-9), 0.5 / RUNGS, 1.0))
 
 
+def mixes(options: Options, kind: str) -> bool:
+    """Whether the network that the options ask for mixes colors."""
+    return kind == "color" and options.mixes
+
+
 def train_config(options: Options, kind: str) -> TrainConfig:
     """The networks that the options ask for."""
     dtype = "bfloat16" if options.bf16 else "float32"
@@ -103,7 +111,9 @@ def train_config(options: Options, kind: str) -> TrainConfig:
     opposed = "instance" if norm == "none" else norm
     judge = DiscriminatorConfig(options.discriminator_width, opposed, dtype)
     return TrainConfig(
-        GeneratorConfig(OUTPUTS[kind], options.width, norm, options.upsampling, dtype),
+        GeneratorConfig(
+            OUTPUTS[kind], options.width, norm, options.upsampling, dtype, mixes(options, kind)
+        ),
         judge if options.gan > 0.0 else None,
         options.average,
     )
@@ -134,7 +144,7 @@ RECOLOR = 0.7
 """Largest change of the logarithm of absorption over scattering, in each channel."""
 
 
-def make_batches(pairs: Pairs, options: Options, recolor: bool = False):
+def make_batches(pairs: Pairs, options: Options, kind: str = "height"):
     """`batches(step) -> (Batch on the device, numbers of its pairs)`; the same whether all pairs
     are on the device or not."""
     device = jax.devices()[0]
@@ -143,7 +153,8 @@ def make_batches(pairs: Pairs, options: Options, recolor: bool = False):
     gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
     # The paint knows no direction, so every pair is worth eight.
     turn = jax.jit(turned)
-    change = jax.jit(recolored)
+    change = jax.jit(functools.partial(recolored, mixes=mixes(options, kind)))
+    recolor = kind == "color" and options.recolor
 
     def batches(step: int):
         index = indices(options.seed, step, options.batch, len(pairs))
@@ -220,7 +231,9 @@ def _begun(options: Options, state, wanted: GeneratorConfig, pairs: Pairs):
         pictures = (pairs.take(some).inputs for some in np.array_split(index, -(-len(index) // 8)))
         config, variables = folded(config, variables, pictures)
     lines = checkpoint.differences(checkpoint.as_dict(config), checkpoint.as_dict(wanted))
-    inputs = [p["encode1"]["kernel"].shape[2] for p in (variables["params"], state.generator)]
+    inputs = [
+        inputs_of(c, p) for c, p in ((config, variables["params"]), (wanted, state.generator))
+    ]
     if inputs[0] != inputs[1]:
         lines.append(f"inputs: {inputs[0]} saved, {inputs[1]} given")
     if lines:
@@ -283,7 +296,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
     chosen = train_config(options, kind)
     init, update = make_train(chosen)
     params = make_params(options.l1, options.gan, options.rate, options.discriminator_rate)
-    batches = make_batches(train, options, recolor=kind == "color" and options.recolor)
+    batches = make_batches(train, options, kind)
     held = jax.device_put(held)
     seconds = np.inf if options.minutes is None else 60.0 * options.minutes
     last_step = np.inf if options.steps is None else options.steps

@@ -60,19 +60,30 @@ def mix_linear(shares, palette):
     return jnp.matmul(shares, palette, precision=jax.lax.Precision.HIGHEST)
 
 
-def mix_subtractive(shares, palette, exponent: float = 0.35):
-    """Mixture by a power mean of absorption over scattering (Kubelka, Munk 1931: K/S of an opaque
-    layer is (1 - R)^2 / 2R), channel by channel.
+def absorbed(color, exponent: float = 0.35):
+    """Linear RGB to a power of absorption over scattering (Kubelka, Munk 1931: K/S of an opaque
+    layer is (1 - R)^2 / 2R), channel by channel: where paints mix, this is their mean.
 
     Exponent 1 is Kubelka-Munk with one constant, which lets a trace of a dark pigment take over;
     a smaller exponent is closer to what paint from tubes does.
     """
-    reflectance = jnp.clip(palette, 1e-3, 0.999)
-    ratio = (1.0 - reflectance) ** 2 / (2.0 * reflectance)
-    mean = jnp.matmul(shares, ratio**exponent, precision=jax.lax.Precision.HIGHEST)
+    reflectance = jnp.clip(color, 1e-3, 0.999)
+    return ((1.0 - reflectance) ** 2 / (2.0 * reflectance)) ** exponent
+
+
+def reflected(mean, exponent: float = 0.35):
+    """Inverse of `absorbed`, on [1e-3, 0.999]."""
     # A pixel without paint has no ratio; the bound keeps its slope finite.
     mixed = jnp.maximum(mean, 1e-8) ** (1.0 / exponent)
-    return 1.0 + mixed - jnp.sqrt(mixed * mixed + 2.0 * mixed)
+    # As a quotient: the difference of the same terms cancels where it is dark.
+    return 1.0 / (1.0 + mixed + jnp.sqrt(mixed * mixed + 2.0 * mixed))
+
+
+def mix_subtractive(shares, palette, exponent: float = 0.35):
+    """Mixture of pigments by the mean of what `absorbed` makes of them."""
+    mean = absorbed(palette, exponent)
+    mean = jnp.matmul(shares, mean, precision=jax.lax.Precision.HIGHEST)
+    return reflected(mean, exponent)
 
 
 MIXING = {"linear": mix_linear, "subtractive": mix_subtractive}

@@ -12,6 +12,7 @@ import numpy as np
 import orbax.checkpoint as ocp
 from orbax.checkpoint import checkpoint_managers as policies
 
+from jaxbrush import mixing
 from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.structs import state
 
@@ -234,7 +235,7 @@ def load(path) -> Exported:
     options = GeneratorConfig(**header["config"])
     kernel = arrays.get("params/encode1/kernel")
     channels = kernel.shape[2] if kernel is not None and kernel.ndim == 4 else 1
-    shape = (1, 4, 4, channels)
+    shape = (1, 4, 4, channels + (mixing.COLORS if options.mixes else 0))
     expected = jax.eval_shape(
         lambda key: Generator(options).init(key, jnp.zeros(shape), jnp.ones((1, 4, 4, 1))),
         jax.random.key(0),

@@ -45,25 +45,24 @@ def _kernel_slope_products(x, kernel, slope):
 
     XLA's CPU backend computes this gradient as a convolution with a kernel of the picture's size,
     at a quarter of its speed. Of the two pictures the one with fewer channels is the one that is
-    shifted, by as many taps at once as make the product wide.
+    shifted, by as many taps at once as make the product wide; the other is turned round once, for
+    XLA would do it for every product.
     """
     k, _, ins, outs = kernel.shape
     swapped = outs < ins
     still, moving = (x, _pad(slope, k - 1, k - 1)) if swapped else (slope, x)
     n, h, w, _ = still.shape
     channels = moving.shape[3]
-    still = still.reshape(n * h * w, -1)
+    turned = still.reshape(n * h * w, -1).T
     starts = range(k - 1, -1, -1) if swapped else range(k)
 
     def product(wide):
-        wide = wide.reshape(n * h * w, -1)
-        sides = (still, wide) if swapped else (wide, still)
-        return lax.dot_general(
-            *sides, (((0,), (0,)), ((), ())), preferred_element_type=jnp.float32
+        return jnp.matmul(
+            turned, wide.reshape(n * h * w, -1), preferred_element_type=jnp.float32
         )  # fmt: skip
 
     # Loops, because each product in a row of them would be compiled by itself.
-    if k * channels <= 512:
+    if k * channels <= 256 or k * k * channels <= 512:
         wide = jnp.concatenate([moving[:, :, x : x + w] for x in starts], axis=-1)
         if k * k * channels <= 512:
             wide = jnp.concatenate([wide[:, y : y + h] for y in starts], axis=-1)
@@ -77,8 +76,9 @@ def _kernel_slope_products(x, kernel, slope):
         slopes = lax.map(
             lambda tap: product(lax.dynamic_slice(moving, (0, tap[0], tap[1], 0), size)), taps
         )
-    if swapped:
-        slopes = slopes.reshape(slopes.shape[0], ins, -1, outs).transpose(0, 2, 1, 3)
+    # (products, still, taps of a product, moving)
+    slopes = slopes.reshape(slopes.shape[0], turned.shape[0], -1, channels)
+    slopes = slopes.transpose((0, 2, 1, 3) if swapped else (0, 2, 3, 1))
     return slopes.reshape(kernel.shape).astype(kernel.dtype)
 
 

@@ -13,25 +13,20 @@ import os
 import zlib
 from pathlib import Path
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
+from jaxbrush.batches import LEVELS
 from jaxbrush.brush import BrushConfig
-from jaxbrush.canvas import from_srgb, to_srgb
 from jaxbrush.paint import PaintConfig
 from jaxbrush.pairs import PairConfig, Picture, canvas_pairs, canvases_pairs
 from jaxbrush.structs import config
-from jaxbrush.train import Batch
 
-FORMAT = 4
+FORMAT = 5
 FULL = 65535
-LEVELS = {"height": 1.25, "pressure": 6.0, "sweeps": 64.0, "time": 64.0}
-"""Values that uint16's 65535 stands for: height [mm], pressure [maps' unit], sweeps, way of the
-brush [mm]; others 1."""
 CHANNELS = (
     ("height", 1), ("color", 3), ("pressure", 1), ("sweeps", 1), ("trajectory", 3), ("time", 1),
-    ("load", 1), ("new_height", 1), ("new_color", 3), ("mask", 1),
+    ("load", 1), ("tip", 1), ("picked", 3), ("lift", 1), ("new_height", 1), ("new_color", 3),
+    ("mask", 1),
 )  # fmt: skip
 SPLITS = ("train", "test")
 TESTS = 1_000_000
@@ -67,7 +62,7 @@ class DataConfig:
 
 PRESETS = {
     "tiny": DataConfig(PairConfig(), train=50, test=10, shard=2),
-    "cpu": DataConfig(PairConfig(), train=320, test=28, shard=2),
+    "cpu": DataConfig(PairConfig(), train=200, test=28, shard=2),
     "small": DataConfig(
         PairConfig(size=256, strokes=5, stamps=576, bristles=256), train=200, test=25, shard=5
     ),
@@ -75,7 +70,7 @@ PRESETS = {
         PairConfig(size=512, strokes=5, stamps=1024, bristles=256), train=2000, test=200, shard=5
     ),
 }
-"""tiny: 200 + 40 pairs of 128 x 128. cpu: 1,280 + 112 such, what two cores make in
+"""tiny: 200 + 40 pairs of 128 x 128. cpu: 800 + 112 such, what two cores make in
 half an hour.
 small: 1,000 + 125 of 256 x 256. paper: 10,000 + 1,000 of 512 x 512, as many as the paper's."""
 
@@ -260,140 +255,3 @@ def load(folder) -> Dataset:
     planes = [check_shard(folder, options, n) for n in range(options.shards)]
     first = options.train // options.shard
     return Dataset(options, manifest["seed"], {"train": planes[:first], "test": planes[first:]})
-
-
-def _network(x):
-    """[0, 1] to the networks' [-1, 1]."""
-    return 2.0 * x - 1.0
-
-
-def network_height(height):
-    """Height [mm] in network scale: 0 mm is -1, `LEVELS["height"]` is 1."""
-    return _network(height / LEVELS["height"])
-
-
-TOUCH = 0.2
-"""Of [0, 1], what the pressure map shows where only the coat of paint touches."""
-
-
-def touched(pairs: dict):
-    """Where bristles came, (n, h, w, 1) bool: also those that touch with their coat alone, whose
-    force is none."""
-    return (jnp.asarray(pairs["time"]) > 0.0) | (jnp.asarray(pairs["pressure"]) > 0.0)
-
-
-def network_pressure(pressure, touch):
-    """Pressure in network scale, compressed by a root: most of a stroke is light. The rest, where
-    nothing came, is told from the lightest touch (`touch`, bool) by a step of `TOUCH`."""
-    share = jnp.sqrt(jnp.clip(pressure / LEVELS["pressure"], 0.0, 1.0))
-    return _network(jnp.where(touch, TOUCH + (1.0 - TOUCH) * share, 0.0))
-
-
-def network_sweeps(sweeps):
-    """Sweep count in network scale, by its logarithm: grooves follow it, most where it is low."""
-    share = jnp.log1p(jnp.maximum(sweeps, 0.0)) / np.float32(np.log1p(LEVELS["sweeps"]))
-    return _network(jnp.minimum(share, 1.0))
-
-
-WAY = 4.0
-"""[mm] on which the networks' scale of the way is about linear; beyond, it grows as its logarithm,
-so that long strokes keep a slope and stay within what was learned."""
-
-
-def network_time(time):
-    """The time map, the way of the brush [mm], in network scale."""
-    share = jnp.log1p(jnp.maximum(time, 0.0) / WAY) / np.float32(np.log1p(LEVELS["time"] / WAY))
-    return _network(jnp.minimum(share, 1.0))
-
-
-HANDS = ("pressure", "sweeps", "both")
-
-
-def height_batch(pairs: dict, hand: str = "both", time: bool = True, load: bool = True) -> Batch:
-    """Inputs and target of the height network: background height, the hand, the way that the brush
-    had gone, its load -> new height.
-
-    Args:
-      hand: what tells of the hand, one of HANDS: the pressure map as in the paper, the sweep count
-        (its Figure 3), or both. The pressure of the latest bristle says little of where hair is
-        dense, and grooves are: on bare canvas their correlation with it is -0.01, with the
-        logarithm of the count 0.26.
-      time, load: whether these are given: a brush lays less as it empties.
-
-    Raises:
-      ValueError: another hand.
-    """
-    if hand not in HANDS:
-        raise ValueError(f"hand = {hand!r}: expected one of {HANDS}")
-    parts = [network_height(pairs["height"])]
-    if hand != "sweeps":
-        parts.append(network_pressure(jnp.asarray(pairs["pressure"]), touched(pairs)))
-    if hand != "pressure":
-        parts.append(network_sweeps(jnp.asarray(pairs["sweeps"])))
-    if time:
-        parts.append(network_time(jnp.asarray(pairs["time"])))
-    if load:
-        parts.append(_network(jnp.asarray(pairs["load"])))
-    return Batch(
-        inputs=jnp.concatenate(parts, axis=-1),
-        target=network_height(jnp.asarray(pairs["new_height"])),
-        mask=jnp.asarray(pairs["mask"]),
-    )
-
-
-def color_batch(pairs: dict, time: bool = True, height: bool = True) -> Batch:
-    """Inputs and target of the color network: background color, color trajectory, time, new height
-    -> new color, all in sRGB.
-
-    Args:
-      time, height: whether these maps are given (paper Figures 4 and 5).
-    """
-    parts = [_network(jnp.asarray(pairs["color"])), _network(jnp.asarray(pairs["trajectory"]))]
-    if time:
-        parts.append(network_time(jnp.asarray(pairs["time"])))
-    if height:
-        parts.append(network_height(jnp.asarray(pairs["new_height"])))
-    return Batch(
-        inputs=jnp.concatenate(parts, axis=-1),
-        target=_network(jnp.asarray(pairs["new_color"])),
-        mask=jnp.asarray(pairs["mask"]),
-    )
-
-
-def recolored(batch: Batch, channels, scale) -> Batch:
-    """A batch of the color network as if all had been painted in other colors.
-
-    Paint mixes channel by channel, by the mean of a power of its absorption over scattering
-    (`canvas.mix_subtractive`): to permute channels and to scale this ratio is exact, but where a
-    film is so thin that the ground shows through.
-
-    Args:
-      channels: (3,) a permutation. scale: (3,) factor on the ratio of each channel, before that.
-    """
-
-    def change(x):
-        bright = jnp.clip(from_srgb(0.5 * (x + 1.0)), 1e-3, 0.999)
-        ratio = scale[None, None, None] * (1.0 - bright) ** 2 / (2.0 * bright)
-        bright = 1.0 / (1.0 + ratio + jnp.sqrt(ratio * ratio + 2.0 * ratio))
-        return _network(to_srgb(bright))[..., channels]
-
-    before, stroke, rest = jnp.split(batch.inputs, (3, 6), axis=-1)
-    none = jnp.all(stroke == -1.0, axis=-1, keepdims=True)
-    stroke = jnp.where(none, -1.0, change(stroke))
-    inputs = jnp.concatenate([change(before), stroke, rest], axis=-1)
-    return dataclasses.replace(batch, inputs=inputs, target=change(batch.target))
-
-
-PREVIEW_FILM = 0.227
-"""[mm] that the preview lays: median where bristles came over bare canvas, in the 48 training pairs
-of the tiny data set, seed 0."""
-
-
-def preview(pairs: dict) -> dict[str, jax.Array]:
-    """The stroke from its maps alone: where bristles came, a film of one thickness and color."""
-    cover = touched(pairs)
-    height = jnp.where(cover, jnp.maximum(pairs["height"], PREVIEW_FILM), pairs["height"])
-    return {
-        "new_height": height,
-        "new_color": jnp.where(cover, pairs["trajectory"], pairs["color"]),
-    }

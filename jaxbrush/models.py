@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 from flax import linen as nn
 
+from jaxbrush import mixing
 from jaxbrush.convolutions import KERNEL, UPSAMPLING, convolve, convolve_up
 from jaxbrush.structs import config
 
@@ -54,18 +55,22 @@ def _check(options):
 class GeneratorConfig:
     """outputs: channels, 1 for height, 3 for color. width: factor on the channels between. norm:
     one of NORMS. upsampling: "resize" or "transposed". dtype: of the convolutions; parameters,
-    moments and the output are float32 in any case."""
+    moments and the output are float32 in any case. mixes: of color, whether the network says how
+    much of which paint is seen (`mixing`), in place of a color."""
 
     outputs: int = 1
     width: float = 1.0
     norm: str = "instance"
     upsampling: str = "resize"
     dtype: str = "float32"
+    mixes: bool = False
 
     def __post_init__(self):
         _check(self)
         if self.outputs < 1:
             raise ValueError(f"outputs = {self.outputs}: expected at least 1")
+        if self.mixes and self.outputs != 3:
+            raise ValueError(f"mixes with outputs = {self.outputs}: expected 3, a color")
         if self.upsampling not in UPSAMPLING:
             raise ValueError(
                 f"upsampling = {self.upsampling!r}: expected one of {tuple(UPSAMPLING)}"
@@ -188,6 +193,9 @@ class Generator(nn.Module):
     """C64S1-ReLU-C128S2-N-ReLU-C128S1-N-ReLU-C256S2-N, then
     ReLU-RC128S2-N-ReLU-RC128S1-N-ReLU-RC64S2-N-ReLU-RCkS1-tanh, with skips between mirror layers.
 
+    One that mixes has as many filters in its last layer as there are paints, and no tanh; its first
+    layer does not see the colors among its inputs, only the mixture does (`mixing`).
+
     Call it by `apply(variables, inputs, weights, pooled=, train=)`:
 
     Args:
@@ -222,7 +230,7 @@ class Generator(nn.Module):
         def join(*parts):
             return jnp.concatenate(parts, axis=-1)
 
-        x = inputs.astype(c.dtype)
+        x = (inputs[..., mixing.COLORS :] if c.mixes else inputs).astype(c.dtype)
         first = layer("encode1", x, 64, norm="none")
         second = layer("encode2", first, 128, stride=2)
         third = layer("encode3", second, 128)
@@ -230,8 +238,15 @@ class Generator(nn.Module):
         x = layer("decode1", x, 128, up=c.upsampling)
         x = layer("decode2", join(x, third), 128)
         x = layer("decode3", join(x, second), 64, up=c.upsampling)
-        x = Conv(c.outputs, c.dtype, name="decode4")(join(x, first))
-        return jnp.tanh(x.astype(jnp.float32))
+        outputs = mixing.PAINTS if c.mixes else c.outputs
+        x = Conv(outputs, c.dtype, name="decode4")(join(x, first)).astype(jnp.float32)
+        return mixing.mix(x, inputs) if c.mixes else jnp.tanh(x)
+
+
+def inputs_of(options: GeneratorConfig, params: dict) -> int:
+    """How many input channels a generator of these parameters takes."""
+    seen = params["encode1"]["kernel"].shape[2]
+    return seen + mixing.COLORS if options.mixes else seen
 
 
 class Discriminator(nn.Module):

@@ -14,6 +14,7 @@ import numpy as np
 from jaxbrush import checkpoint, patches
 from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
+from jaxbrush.models import inputs_of
 from jaxbrush.pairs import LOAD, REACH
 from jaxbrush.patches import Box, Layout, Rect
 from jaxbrush.raster import trajectory_maps
@@ -34,7 +35,8 @@ from jaxbrush.stages import (
 from jaxbrush.stages import paint_on as paint_on
 from jaxbrush.stylus import Stroke, stamps_needed
 
-HEIGHT_INPUTS, COLOR_INPUTS = 5, 8
+HEIGHT_INPUTS, COLOR_INPUTS, MIXED_INPUTS = 6, 8, 15
+"""Channels that the networks are given: height, color, and color of one that mixes."""
 
 
 def make_nets(height: checkpoint.Exported, color: checkpoint.Exported) -> Nets:
@@ -43,10 +45,11 @@ def make_nets(height: checkpoint.Exported, color: checkpoint.Exported) -> Nets:
     Raises:
       ValueError: networks of other inputs or outputs.
     """
+    colors = MIXED_INPUTS if color.config.mixes else COLOR_INPUTS
     for name, net, inputs, outputs in (
-        ("height", height, HEIGHT_INPUTS, 1), ("color", color, COLOR_INPUTS, 3),
+        ("height", height, HEIGHT_INPUTS, 1), ("color", color, colors, 3),
     ):  # fmt: skip
-        have = net.variables["params"]["encode1"]["kernel"].shape[2]
+        have = inputs_of(net.config, net.variables["params"])
         if (have, net.config.outputs) != (inputs, outputs):
             raise ValueError(
                 f"the {name} network has {have} inputs and {net.config.outputs} outputs: expected "
@@ -73,8 +76,8 @@ def _needed(options, brush, stroke):
     return stamps_needed(stroke, options.pixel, np.inf, brush.press_depth)
 
 
-def _draw_and_count(options, box, shape, track, color):
-    drawn = draw(options, box, shape, track, color)
+def _draw_and_count(options, box, canvas, track, color):
+    drawn = draw(options, box, canvas, track, color)
     if isinstance(box, Rect):
         return drawn, jnp.any(drawn.mask > 0.0).astype(jnp.int32)
     return drawn, patches.needed(options.patches, box, drawn.mask[..., 0])
@@ -212,7 +215,7 @@ def plan(options: PainterConfig, canvas: Canvas, brush: BrushParams, stroke: Str
         return None
     if isinstance(box, Rect):
         return Sizes(track.time.shape[0], sides=box.sides), box.corner
-    _, need = draw_on(options, box, shape, track, jnp.zeros(3))
+    _, need = draw_on(options, box, canvas, track, jnp.zeros(3))
     sizes = Sizes(track.time.shape[0], box.cells, _count(options, int(need)))
     return sizes, box.first
 
@@ -255,7 +258,7 @@ def paint_track(
     box = place(options, shape, bounds)
     if box is None:
         return canvas
-    drawn, need = draw_on(options, box, shape, track, jnp.asarray(color, float))
+    drawn, need = draw_on(options, box, canvas, track, jnp.asarray(color, float))
     watch("maps", drawn)
     need = int(need)
     if not need:
@@ -297,7 +300,7 @@ def preview_stroke(
     if box is None:
         return canvas
     color = jnp.asarray(color, float)
-    drawn, _ = draw_on(options, box, canvas.height.shape, track, color)
+    drawn, _ = draw_on(options, box, canvas, track, color)
     return (_preview_over if donate else _preview)(options, box, drawn, canvas, color)
 
 

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, make_brush, rollout
-from jaxbrush.canvas import flatten, from_srgb, to_srgb
+from jaxbrush.canvas import Canvas, flatten, from_srgb, to_srgb
 from jaxbrush.paint import (
     BrushPaint,
     PaintConfig,
@@ -25,7 +25,8 @@ from jaxbrush.paint import (
     weave,
 )
 from jaxbrush.paint.state import TUNED_AREA, TUNED_HAIRS
-from jaxbrush.raster import TrajectoryMaps, make_grid, trajectory_maps
+from jaxbrush.pickup import picked_up
+from jaxbrush.raster import Grid, make_grid, trajectory_maps
 from jaxbrush.raster.grid import dilate
 from jaxbrush.structs import config, state
 from jaxbrush.stylus import Stroke, random_stroke, resample, transform, way
@@ -94,9 +95,10 @@ class Picture:
 
     height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
     time, load: (h, w) and trajectory: (h, w, 3) maps of the stroke; sweeps and load of a `Loaded`
-    track, time by the clock of `on_way` [mm].
-    mask: (h, w) 1 where it may have changed something. reached: () whether the brush stayed inside
-    the simulated window.
+    track, time by the clock of `on_way` [mm]. tip: (h, w) height of the latest bristle's tip [mm],
+    up to `COAT`. picked: (h, w, 3), lift: (h, w) what bristles had picked up (`picked_up`). mask:
+    (h, w) 1 where it may have changed something. reached: () whether the brush stayed inside the
+    simulated window.
     """
 
     height: jax.Array
@@ -106,6 +108,9 @@ class Picture:
     trajectory: jax.Array
     time: jax.Array
     load: jax.Array
+    tip: jax.Array
+    picked: jax.Array
+    lift: jax.Array
     new_height: jax.Array
     new_color: jax.Array
     mask: jax.Array
@@ -194,17 +199,32 @@ def loaded(track: BristleTrack, brush: BrushParams, load=LOAD, coat: float = COA
     return Loaded(**own, hairs=each * every, load=jnp.asarray(load, float) * every)
 
 
-def scaled_maps(maps: TrajectoryMaps, track: Loaded) -> dict[str, jax.Array]:
-    """Maps as the networks are told them: pressure, sweeps by hairs in place of bristles, time by
-    the track's clock, load where the brush came, (h, w) each, trajectory (h, w, 3)."""
+def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
+    """Maps as the networks are told them.
+
+    Args:
+      grid: pixels, as large as those of the canvas. canvas: (h, w) before the stroke, all of it.
+      color: (3,) of the paint, linear RGB. edge: as in `trajectory_maps`.
+
+    Returns:
+      (dict of pressure, sweeps by hairs in place of bristles, time by the track's clock, load where
+      the brush came, tip, lift (h, w), trajectory and picked (h, w, 3) in sRGB; TrajectoryMaps).
+    """
+    picked, lift = picked_up(track, canvas, grid.pixel, COAT)
+    tip = jnp.clip(track.position[:, -1, 2], 0.0, COAT)
+    carried = jnp.concatenate([to_srgb(picked), lift[..., None], tip[..., None]], axis=-1)
+    maps = trajectory_maps(grid, track, carried, edge=edge)
     end = jnp.max(jnp.where(track.valid, track.time, 0.0))
     return {
         "pressure": maps.pressure,
         "sweeps": track.hairs[0] * maps.sweeps,
         "time": end * maps.time,
         "load": track.load[0] * maps.coverage,
-        "trajectory": maps.color,
-    }
+        "trajectory": maps.coverage[..., None] * to_srgb(jnp.asarray(color, float)),
+        "picked": maps.color[..., :3],
+        "lift": maps.color[..., 3],
+        "tip": maps.color[..., 4],
+    }, maps
 
 
 def on_way(track: BristleTrack, stroke: Stroke, depth) -> BristleTrack:
@@ -248,12 +268,12 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
     grid = make_grid((options.size, options.size), pixel=options.paint.pixel)
     drawn = on_way(loaded(track, plan.brush, plan.load), plan.stroke, plan.brush.press_depth)
     drawn = jax.tree.map(lambda x: x[:: options.every], drawn)
-    maps = trajectory_maps(grid, drawn, to_srgb(own))
     before, now = seen(canvas), seen(after)
+    told, maps = drawn_maps(grid, drawn, before, own)
     return after, Picture(
         height=before.height,
         color=to_srgb(before.color),
-        **scaled_maps(maps, drawn),
+        **told,
         new_height=now.height,
         new_color=to_srgb(now.color),
         mask=dilate(maps.coverage, REACH),

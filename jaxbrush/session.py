@@ -13,9 +13,9 @@ import jax
 import numpy as np
 
 from jaxbrush import painter
+from jaxbrush.batches import PREVIEW_FILM
 from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
-from jaxbrush.data import PREVIEW_FILM
 from jaxbrush.painter import Nets, PainterConfig
 from jaxbrush.pairs import LOAD
 from jaxbrush.patches import Box

@@ -17,14 +17,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxbrush import data, patches, poisson
+from jaxbrush import batches, patches, poisson
 from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, rollout
 from jaxbrush.canvas import Canvas, from_srgb, to_srgb
 from jaxbrush.metrics import image_scale
 from jaxbrush.models import Generator, GeneratorConfig
-from jaxbrush.pairs import LOAD, REACH, Loaded, loaded, on_way, scaled_maps
+from jaxbrush.pairs import LOAD, REACH, Loaded, drawn_maps, loaded, on_way
 from jaxbrush.patches import Box, Layout, PatchConfig, Rect
-from jaxbrush.raster import WIDTH, dilate, trajectory_maps
+from jaxbrush.raster import WIDTH, dilate
 from jaxbrush.structs import config, state
 from jaxbrush.stylus import Stroke, resample
 
@@ -107,16 +107,19 @@ class Nets:
 
 @state
 class Drawn:
-    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm], load (h, w, 1),
-    trajectory (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as there, 0 off the canvas.
-    share: (h, w, 1) of what is painted in what the canvas becomes: 1 where bristles came, falling
-    to 0 within `RIM`. whole: () as in TrajectoryMaps."""
+    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm], load, tip [mm], lift
+    (h, w, 1), trajectory, picked (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as
+    there, 0 off the canvas. share: (h, w, 1) of what is painted in what the canvas
+    becomes: 1 where bristles came, falling to 0 within `RIM`. whole: () as in TrajectoryMaps."""
 
     pressure: jax.Array
     sweeps: jax.Array
     time: jax.Array
     load: jax.Array
+    tip: jax.Array
+    lift: jax.Array
     trajectory: jax.Array
+    picked: jax.Array
     mask: jax.Array
     share: jax.Array
     whole: jax.Array
@@ -192,14 +195,14 @@ def faded(cover):
     return share, cover
 
 
-def draw(options: PainterConfig, box: Box | Rect, shape, track: Loaded, color) -> Drawn:
+def draw(options: PainterConfig, box: Box | Rect, canvas: Canvas, track: Loaded, color) -> Drawn:
     """Draws the maps of a stroke on its box, scaled as in training pairs.
 
     Args:
-      shape: (h, w) of the canvas. track: from `trace`. color: (3,) of the paint, linear RGB.
+      canvas: before the stroke. track: from `trace`. color: (3,) of the paint, linear RGB.
     """
-    grid = patches.grid_of(options.patches, box, options.pixel)
-    maps = trajectory_maps(grid, track, to_srgb(jnp.asarray(color, float)), edge=options.edge)
+    grid, shape = patches.grid_of(options.patches, box, options.pixel), canvas.height.shape
+    told, maps = drawn_maps(grid, track, canvas, color, options.edge)
     at = patches.corner_of(options.patches, box)
     row, column = (at[k] + jnp.arange(grid.shape[k], dtype=jnp.int32) for k in (0, 1))
     inside = ((row >= 0) & (row < shape[0]))[:, None] & ((column >= 0) & (column < shape[1]))[None]
@@ -207,11 +210,8 @@ def draw(options: PainterConfig, box: Box | Rect, shape, track: Loaded, color) -
     # Kept as an array: worked out again at every shift of the dilation it is slow.
     cover = jax.lax.optimization_barrier(maps.coverage)
     share, grown = faded(cover)
-    told = scaled_maps(maps, track)
-    trajectory = told.pop("trajectory")
     return Drawn(
-        **{name: x[..., None] for name, x in told.items()},
-        trajectory=trajectory,
+        **{name: x.reshape(*grid.shape, -1) for name, x in told.items()},
         mask=inside * dilate(grown, REACH - RIM)[..., None],
         share=inside * share[..., None],
         whole=maps.whole,
@@ -227,10 +227,13 @@ def cut(
       layout: of the box; a Rect is its own.
 
     Returns:
-      dict of height [mm], pressure, sweeps, time, load, mask, share (n, size, size, 1), color,
-      trajectory (n, size, size, 3) in sRGB; of a Rect one, of its sides.
+      dict of height [mm], pressure, sweeps, time, load, tip, lift, mask, share (n, size, size,
+      1), color, trajectory, picked (n, size, size, 3) in sRGB; of a Rect one, of its sides.
     """
-    names = ("pressure", "sweeps", "time", "load", "mask", "share", "trajectory")
+    names = (
+        "pressure", "sweeps", "time", "load", "tip", "lift", "mask", "share", "trajectory",
+        "picked",
+    )  # fmt: skip
     field = jnp.concatenate([getattr(drawn, name) for name in names], axis=-1)
     if isinstance(box, Rect):
         field, corner = field[None], box.corner[None]
@@ -240,7 +243,7 @@ def cut(
     return {
         "height": patches.cut_canvas(canvas.height, corner, sides)[..., None],
         "color": to_srgb(patches.cut_canvas(canvas.color, corner, sides)),
-        **dict(zip(names, jnp.split(field, (1, 2, 3, 4, 5, 6), axis=-1), strict=True)),
+        **dict(zip(names, jnp.split(field, (1, 2, 3, 4, 5, 6, 7, 8, 11), axis=-1), strict=True)),
     }
 
 
@@ -285,21 +288,22 @@ def evaluate(
         found = Generator(generator).apply(variables, inputs, weights, pooled=pooled)
         return image_scale(found)
 
-    level = data.LEVELS["height"]
+    level = batches.LEVELS["height"]
     before = jnp.clip(pairs["height"], 0.0, level)
     # Chosen where there is none: a root has no slope at 0.
     press = jnp.where(pairs["pressure"] > 0.0, pairs["pressure"], 0.0)
     given = pairs | {
         "height": before, "pressure": press, "new_height": before, "new_color": pairs["color"],
     }  # fmt: skip
-    height = run(nets.height_config, nets.height, data.height_batch(given).inputs)
+    height = run(nets.height_config, nets.height, batches.height_batch(given).inputs)
     laid = height
     if pooled and layout is not None:
         # Patches see one height wherever they overlap, as if there were one picture.
         laid = patches.recut(options.patches, blend(options, height, layout), layout)
     # The canvas as it will be.
     given["new_height"] = before + pairs["share"] * (level * laid - before)
-    color = run(nets.color_config, nets.color, data.color_batch(given).inputs)
+    seen = batches.color_batch(given, mixes=nets.color_config.mixes).inputs
+    color = run(nets.color_config, nets.color, seen)
     return jnp.concatenate([height, color], axis=-1)
 
 
@@ -329,7 +333,7 @@ def lay(
         return patches.place(old + step, layout, field, changed)
 
     return Canvas(
-        height=over(canvas.height, data.LEVELS["height"] * tiles[..., 0]),
+        height=over(canvas.height, batches.LEVELS["height"] * tiles[..., 0]),
         color=over(canvas.color, from_srgb(tiles[..., 1:])),
     )
 
@@ -355,12 +359,12 @@ def paint_on(
     track = trace(options, brush, place_stamps(options, brush, stroke, sizes.stamps), load)
     if sizes.sides is not None:
         rect = Rect(corner=first, sides=sizes.sides)
-        drawn = draw(options, rect, canvas.height.shape, track, color)
+        drawn = draw(options, rect, canvas, track, color)
         pairs = cut(options, rect, drawn, canvas, rect)
         painted = evaluate(options, nets, pairs, rect)
         return lay(options, rect, drawn, canvas, rect, painted), drawn.whole
     box = Box(first=first, cells=sizes.cells)
-    drawn = draw(options, box, canvas.height.shape, track, color)
+    drawn = draw(options, box, canvas, track, color)
     layout = patches.layout(options.patches, box, drawn.mask[..., 0], sizes.count)
     pairs = cut(options, box, drawn, canvas, layout)
     if options.moments == "stroke" or sizes.count <= options.batch:
@@ -374,7 +378,7 @@ def paint_on(
 
 
 def preview(options: PainterConfig, box: Box | Rect, drawn: Drawn, canvas: Canvas, color) -> Canvas:
-    """Lays a stroke over the canvas as `data.preview` shows it, from its maps alone."""
+    """Lays a stroke over the canvas as `batches.preview` shows it, from its maps alone."""
     shape = canvas.height.shape
     corner = patches.corner_of(options.patches, box)
     touch = jnp.concatenate([drawn.pressure, drawn.time], axis=-1)
@@ -388,7 +392,7 @@ def preview(options: PainterConfig, box: Box | Rect, drawn: Drawn, canvas: Canva
         touch = jax.lax.slice_in_dim(jnp.roll(touch, corner[k] - at[k], k), 0, sides[k], axis=k)
         touch = jnp.where(jnp.expand_dims(held, (1 - k, 2)), touch, 0.0)
     under = jax.lax.dynamic_slice(canvas.color, (*at, 0), (*sides, 3))
-    shown = data.preview(
+    shown = batches.preview(
         {
             "height": jax.lax.dynamic_slice(canvas.height, at, sides)[..., None],
             "pressure": touch[..., :1],

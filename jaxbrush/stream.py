@@ -102,7 +102,7 @@ class Stream:
         shape = self.canvas.height.shape
         if cell not in self._painted or self._painted[cell][0] < self._touched[cell]:
             rect = Rect(corner=jnp.asarray(corner), sides=(PATCHES.size,) * 2)
-            drawn, _ = painter.draw_on(self.options, rect, shape, self.track(), self.color)
+            drawn, _ = painter.draw_on(self.options, rect, self.canvas, self.track(), self.color)
             part = _paint(self.options, self.nets, self.canvas, drawn, rect.corner)
             self._painted[cell] = self._stamps, jax.device_get(part)
         first = corner + PATCHES.lead

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from experiments import evaluate, make_dataset, train_network
-from jaxbrush import checkpoint, data, pairs
+from jaxbrush import batches, checkpoint, data, pairs
 from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.paint import PaintConfig
@@ -44,7 +44,7 @@ def test_a_pair_depends_on_its_seed_and_number_only(folder):
     alone = pairs.canvas_pairs(SMALL, SEED, 1)[1]
     stored = found.take("train", [3])
     for name, _ in data.CHANNELS:
-        level = data.LEVELS.get(name.removeprefix("new_"), 1.0)
+        level = batches.LEVELS.get(name.removeprefix("new_"), 1.0)
         want = np.clip(getattr(alone, name), 0.0, level)
         np.testing.assert_allclose(np.squeeze(stored[name]), want, atol=0.51 * level / data.FULL)
     other = pairs.canvas_pairs(SMALL, SEED + 1, 1)[1]
@@ -97,33 +97,54 @@ def test_a_stroke_changes_its_mask_and_is_the_next_background(folder):
         assert np.all(p[name][bare] == 0.0)
 
 
+def check_colors(p, inputs):
+    """A brush has its color beside its bristles too, and what it picked up where it did."""
+    came = np.asarray(batches.touched(p))[..., 0]
+    for k in range(len(came)):
+        own = p["trajectory"][k][came[k]][0]
+        everywhere = np.broadcast_to(2.0 * own - 1.0, (48, 48, 3))
+        np.testing.assert_allclose(inputs[k, ..., 3:6], everywhere, atol=1e-4)
+        some = p["lift"][k, ..., 0] > 0.0
+        np.testing.assert_array_equal(inputs[k, ..., 6:9][~some], inputs[k, ..., 3:6][~some])
+        np.testing.assert_allclose(inputs[k, ..., 6:9][some], 2.0 * p["picked"][k][some] - 1.0,
+                                   atol=1e-6)  # fmt: skip
+    # The first stroke found a bare canvas, the second one paint.
+    assert p["lift"][0].max() == 0.0 or p["height"][0].max() > 0.0
+
+
 def test_batches_are_in_network_scale(folder):
     p = data.load(folder).take("test", [0, 1])
-    height = data.height_batch(p)
-    assert height.inputs.shape == (2, 48, 48, 5) and height.target.shape == (2, 48, 48, 1)
-    color = data.color_batch(p)
+    height = batches.height_batch(p)
+    assert height.inputs.shape == (2, 48, 48, 6) and height.target.shape == (2, 48, 48, 1)
+    color = batches.color_batch(p)
     assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
-    assert data.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
-    alone = [data.height_batch(p, hand) for hand in ("pressure", "sweeps")]
+    assert batches.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
+    alone = [batches.height_batch(p, hand) for hand in ("pressure", "sweeps")]
     np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
     np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
-    np.testing.assert_array_equal(height.inputs[..., 3:4], data.network_time(p["time"]))
-    assert data.height_batch(p, time=False, load=False).inputs.shape[-1] == 3
+    np.testing.assert_array_equal(height.inputs[..., 3:4], batches.network_time(p["time"]))
+    assert batches.height_batch(p, time=False, load=False, tip=False).inputs.shape[-1] == 3
+    # Above all hair where none came.
+    high = np.asarray(height.inputs[..., 5:])
+    assert np.all(high[~np.asarray(batches.touched(p))] == 1.0) and high.min() < -0.5
+    mixed = batches.color_batch(p, mixes=True)
+    assert mixed.inputs.shape[-1] == 15
+    check_colors(p, np.asarray(mixed.inputs))
     # One load a stroke, where the brush came.
-    for load, came in zip(p["load"], np.asarray(data.touched(p)), strict=True):
+    for load, came in zip(p["load"], np.asarray(batches.touched(p)), strict=True):
         assert 0.25 <= load.max() <= 1.0 and np.ptp(load[came]) < 1e-4
     # The clock is the way of the brush: some millimetres.
     assert 1.0 < p["time"].max() < 10.0
-    scaled = np.asarray(data.network_time(jnp.asarray([0.0, 1.0, 2.0, 4.0, 64.0, 100.0])))
+    scaled = np.asarray(batches.network_time(jnp.asarray([0.0, 1.0, 2.0, 4.0, 64.0, 100.0])))
     assert scaled[0] == -1.0 and scaled[4] == scaled[5] == 1.0 and np.all(np.diff(scaled[:5]) > 0.0)
-    np.testing.assert_array_equal(color.inputs[..., 6], data.network_time(p["time"])[..., 0])
+    np.testing.assert_array_equal(color.inputs[..., 6], batches.network_time(p["time"])[..., 0])
     with pytest.raises(ValueError, match="hand = 'left'"):
-        data.height_batch(p, "left")
+        batches.height_batch(p, "left")
     for batch in (height, color, *alone):
         for x in jax.tree.leaves(batch):
             assert x.dtype == np.float32
             assert float(x.min()) >= -1.0 and float(x.max()) <= 1.0
-    shown = data.preview(p)
+    shown = batches.preview(p)
     same = (p["time"] == 0.0) & (p["pressure"] == 0.0)
     assert np.all(np.asarray(shown["new_height"])[same] == p["height"][same])
 
@@ -240,7 +261,7 @@ def test_recolored_pairs_are_what_other_paint_would_have_given():
     stroke = target.at[:, :4].set(-1.0)  # no stroke there
     rest = jnp.zeros((1, 16, 16, 2))
     batch = Batch(jnp.concatenate([target, stroke, rest], -1), target, rest[..., :1])
-    found = data.recolored(batch, jnp.asarray(channels, jnp.int32), jnp.asarray(scale))
+    found = batches.recolored(batch, jnp.asarray(channels, jnp.int32), jnp.asarray(scale))
     want = seen(change(palette))[None]
     np.testing.assert_allclose(found.target, want, atol=1e-3)
     np.testing.assert_allclose(found.inputs[..., :3], want, atol=1e-3)
@@ -251,7 +272,7 @@ def test_recolored_pairs_are_what_other_paint_would_have_given():
     naive = 2.0 * to_srgb(scale * np.asarray(from_srgb(0.5 * (target + 1.0)))) - 1.0
     same = seen(np.clip(scale * palette, 0.0, 1.0))[None]
     assert np.abs(naive - same).max() > 0.05
-    nothing = data.recolored(batch, jnp.arange(3, dtype=jnp.int32), jnp.ones(3))
+    nothing = batches.recolored(batch, jnp.arange(3, dtype=jnp.int32), jnp.ones(3))
     np.testing.assert_allclose(nothing.inputs, batch.inputs, atol=2e-3)
     np.testing.assert_array_equal(nothing.mask, batch.mask)
 
@@ -271,7 +292,7 @@ def test_predicted_heights_are_laid_as_in_use(folder):
     index = np.arange(found.count("train"))
     heights = train_network.predicted_heights(found, "train", index, network)
     raw = found.take("train", index)
-    cover = np.asarray(data.touched(raw))
+    cover = np.asarray(batches.touched(raw))
     # Where bristles came it is the network's, far from them the canvas as it was.
     assert np.abs(heights - raw["new_height"])[cover].max() > 0.1
     np.testing.assert_array_equal(heights[raw["mask"] == 0.0], raw["height"][raw["mask"] == 0.0])
@@ -289,7 +310,7 @@ def test_color_is_taught_on_true_and_on_predicted_heights(folder):
     np.testing.assert_array_equal(first.inputs, once.take([1]).inputs)
     np.testing.assert_array_equal(again.inputs[..., :-1], first.inputs[..., :-1])
     np.testing.assert_array_equal(again.target, first.target)
-    np.testing.assert_allclose(again.inputs[..., -1:], data.network_height(laid[1:2]), atol=1e-6)
+    np.testing.assert_allclose(again.inputs[..., -1:], batches.network_height(laid[1:2]), atol=1e-6)
 
 
 def test_heights_to_follow_are_checked_before_work_starts(tmp_path):

@@ -109,8 +109,8 @@ def variables(config, inputs):
 
 @pytest.mark.parametrize("edge", [None, 0.25])
 def test_painter(edge):
-    configs = [GeneratorConfig(outputs=n, width=0.05, norm="none") for n in (1, 3)]
-    inputs = painter.HEIGHT_INPUTS, painter.COLOR_INPUTS
+    configs = [GeneratorConfig(outputs=n, width=0.05, norm="none", mixes=n == 3) for n in (1, 3)]
+    inputs = painter.HEIGHT_INPUTS, painter.MIXED_INPUTS
     nets = stages.Nets(*(variables(c, n) for c, n in zip(configs, inputs, strict=True)), *configs)
     options = painter.PainterConfig(edge=edge)
     sizes = stages.Sizes(stamps=16, sides=(64, 96))

@@ -8,9 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbrush import checkpoint, data, painter, patches, seams, stages
+from jaxbrush import batches, checkpoint, painter, patches, seams, stages
 from jaxbrush.brush import BrushConfig, make_brush
-from jaxbrush.canvas import Canvas, to_srgb
+from jaxbrush.canvas import Canvas, blank, to_srgb
 from jaxbrush.metrics import image_scale
 from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.stylus import make_stroke
@@ -26,8 +26,8 @@ BRUSH = make_brush(
 PAINT = (0.02, 0.1, 0.5)
 
 
-def network(inputs, outputs, norm="instance", width=0.05):
-    config = GeneratorConfig(outputs=outputs, width=width, norm=norm)
+def network(inputs, outputs, norm="instance", width=0.05, mixes=False):
+    config = GeneratorConfig(outputs=outputs, width=width, norm=norm, mixes=mixes)
     shape = jax.eval_shape(
         Generator(config).init,
         jax.random.key(0),
@@ -40,7 +40,7 @@ def network(inputs, outputs, norm="instance", width=0.05):
     return checkpoint.Exported(jax.tree.map(draw, shape), config, {"made by": "a test"})
 
 
-NETS = painter.make_nets(network(5, 1), network(8, 3))
+NETS = painter.make_nets(network(6, 1), network(8, 3))
 
 
 LONG = jax.tree.map(np.asarray, make_stroke(np.zeros((80, 2)), pressure=0.6))
@@ -63,7 +63,7 @@ def line(start, end, count=9):
 def maps_of(stroke, shape=(64, 64), options=OPTIONS):
     track, bounds = painter._begin(options, BRUSH, stroke)
     box = painter.place(options, shape, bounds)
-    drawn, _ = painter.draw_on(options, box, shape, track, jnp.asarray(PAINT))
+    drawn, _ = painter.draw_on(options, box, blank(shape), track, jnp.asarray(PAINT))
     return box, drawn, track, bounds
 
 
@@ -85,7 +85,7 @@ def check_painted(found, before, stroke):
         assert np.all(np.isfinite(new))
         np.testing.assert_array_equal(new[~mask], old[~mask])
         assert np.mean(new[mask] != old[mask]) > 0.99
-    assert found.height.max() <= data.LEVELS["height"] and found.color.max() <= 1.0
+    assert found.height.max() <= batches.LEVELS["height"] and found.color.max() <= 1.0
     return mask
 
 
@@ -213,7 +213,7 @@ def test_the_maps_tell_what_the_brush_holds_and_how_large_it_is():
         stroke = line(*PATHS["inside"])
         track, bounds = painter._begin(OPTIONS, brush, stroke, load)
         box = painter.place(OPTIONS, (64, 64), bounds)
-        return painter.draw_on(OPTIONS, box, (64, 64), track, jnp.asarray(PAINT))[0], track
+        return painter.draw_on(OPTIONS, box, blank((64, 64)), track, jnp.asarray(PAINT))[0], track
 
     (few, a), (many, b), (large, c) = (
         drawn_by(*x) for x in ((1.0, 16, 0.3), (1.0, 64, 0.9), (2.0, 64, 0.9))
@@ -252,10 +252,10 @@ def test_networks_see_what_they_were_trained_on():
         run = lambda net, x: image_scale(  # noqa: E731
             Generator(net.config).apply(net.variables, x)
         )
-        height = run(network(5, 1), data.height_batch(pair).inputs)
-        new = data.LEVELS["height"] * height - pair["height"]
+        height = run(network(6, 1), batches.height_batch(pair).inputs)
+        new = batches.LEVELS["height"] * height - pair["height"]
         new = pair["height"] + pair["share"] * new
-        color = run(network(8, 3), data.color_batch(pair | {"new_height": new}).inputs)
+        color = run(network(8, 3), batches.color_batch(pair | {"new_height": new}).inputs)
         return jnp.concatenate([height, color], axis=-1)
 
     np.testing.assert_allclose(found, by_hand(pair), atol=1e-5)
@@ -342,6 +342,7 @@ def test_moments_of_the_whole_stroke_leave_no_seam():
     drawn = stages.Drawn(
         pressure=draw(1) * shade, sweeps=9.0 * draw(1) * shade, time=draw(1) * shade,
         trajectory=draw(3) * jnp.asarray(mask), load=0.8 * jnp.asarray(mask),
+        tip=0.1 * draw(1), lift=draw(1), picked=draw(3),
         mask=jnp.asarray(mask), share=jnp.asarray(mask), whole=jnp.asarray(True),
     )  # fmt: skip
 
@@ -387,7 +388,7 @@ def test_the_preview_is_that_of_the_maps():
     assert 0.0 < changed.sum() < (mask_of(stroke) > 0.0).sum()
     assert np.all(mask_of(stroke)[changed] > 0.0)
     np.testing.assert_allclose(np.asarray(found.color)[changed], [PAINT] * changed.sum(), atol=1e-6)
-    assert np.all(np.asarray(found.height)[changed] >= data.PREVIEW_FILM - 1e-6)
+    assert np.all(np.asarray(found.height)[changed] >= batches.PREVIEW_FILM - 1e-6)
     np.testing.assert_array_equal(
         np.asarray(found.height)[~changed], np.asarray(before.height)[~changed]
     )
@@ -395,8 +396,8 @@ def test_the_preview_is_that_of_the_maps():
 
 def test_arguments_are_checked(tmp_path):
     with pytest.raises(ValueError, match="color network has 7 inputs"):
-        painter.make_nets(network(5, 1), network(7, 3))
-    for name, net in (("h", network(5, 1)), ("c", network(8, 3))):
+        painter.make_nets(network(6, 1), network(7, 3))
+    for name, net in (("h", network(6, 1)), ("c", network(8, 3))):
         checkpoint.export(tmp_path / f"{name}.npz", net.config, net.variables, net.card)
     nets = painter.load_nets(tmp_path / "h.npz", tmp_path / "c.npz")
     assert nets.color_config.outputs == 3

@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 from jaxbrush import painter, recordings
+from jaxbrush.batches import PREVIEW_FILM
 from jaxbrush.brush import make_brush
 from jaxbrush.canvas import Canvas, blank
-from jaxbrush.data import PREVIEW_FILM
 from jaxbrush.session import Session
 from jaxbrush.stylus import make_stroke
 

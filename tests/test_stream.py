@@ -26,7 +26,7 @@ def nets(norm):
     rng = np.random.default_rng(0)
 
     def one(inputs, outputs):
-        config = GeneratorConfig(outputs, 0.05, norm)
+        config = GeneratorConfig(outputs, 0.05, norm, mixes=outputs == 3)
         shapes = jax.eval_shape(
             Generator(config).init, jax.random.key(0), jnp.zeros((1, 4, 4, inputs))
         )
@@ -34,7 +34,7 @@ def nets(norm):
         draw = lambda x: jnp.asarray(rng.normal(0.0, 0.15, x.shape), jnp.float32)  # noqa: E731
         return jax.tree.map(draw, shapes), config
 
-    (height, height_config), (color, color_config) = one(5, 1), one(8, 3)
+    (height, height_config), (color, color_config) = one(6, 1), one(15, 3)
     return painter.Nets(height, color, height_config, color_config)
 
 

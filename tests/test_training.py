@@ -74,7 +74,7 @@ def test_color_pairs_are_recolored_by_the_number_of_the_step():
     pairs = toy(5, side=8, kind="color")
     options = dataclasses.replace(SMALL, turns=False)
     plain = training.make_batches(pairs, options)(3)[0]
-    make = training.make_batches(pairs, options, recolor=True)
+    make = training.make_batches(pairs, dataclasses.replace(options, mixes=False), "color")
     first, again, other = make(3)[0], make(3)[0], make(8)[0]
     np.testing.assert_array_equal(first.target, again.target)
     assert np.abs(first.target - plain.target).max() > 0.01

@@ -20,7 +20,7 @@ class TrajectoryMaps:
 
     pressure: (h, w) normal force of the latest bristle over the pixel, in `FORCE_UNIT`.
     sweeps: (h, w) how many times a bristle came over the pixel.
-    color: (h, w, 3) color that the latest bristle set out with, linear RGB.
+    color: (h, w, c) what the latest bristle carried.
     time: (h, w) when the latest bristle left the pixel: 0 at the stroke's start, 1 at its end.
     coverage: (h, w) share of the pixel that was touched; 0 or 1 in exact maps. In soft maps the
     others are multiplied by it.
@@ -55,7 +55,8 @@ def trajectory_maps(
     Args:
       grid: pixels.
       track: BristleTrack of t stamps, b bristles.
-      color: (b, 3) or (3,) that each bristle sets out with, linear RGB.
+      color: (c,), (b, c) or (t, b, c) that each bristle carries, such as linear RGB: one for all,
+        one for each, or at each stamp.
       width: of what a bristle sweeps [mm], static.
       edge: width over which soft coverage falls from 1 to 0 [mm], static, or None for exact maps.
         The same width counts in height: a tip `edge` / 2 above the canvas begins to draw.
@@ -81,11 +82,14 @@ def trajectory_maps(
     if not longest > 0.0:
         raise ValueError(f"longest = {longest!r}: expected a positive length [mm]")
     color = jnp.asarray(color, track.position.dtype)
-    if color.shape not in ((3,), (b, 3)):
-        raise ValueError(f"color has shape {color.shape}: expected (3,) or {(b, 3)}")
-    color = jnp.broadcast_to(color, (b, 3))
+    if not 1 <= color.ndim <= 3 or color.shape[:-1] not in ((), (b,), (stamps, b)):
+        raise ValueError(
+            f"color has shape {color.shape}: expected (c,), ({b}, c) or ({stamps}, {b}, c)"
+        )
+    if color.ndim == 1:
+        color = jnp.broadcast_to(color, (b, *color.shape))
     # Each node that draws is a bristle of its own, of the same color.
-    color = jnp.tile(color, (nodes, 1))
+    color = jnp.concatenate([color] * nodes, axis=-2)
     exact.check_keys(stamps, b * nodes)
     if edge is not None:
         return _soft(grid, track, color, width, edge, nodes, longest)
@@ -97,12 +101,13 @@ def trajectory_maps(
     key, passes = exact.images(still, stamps, grid.shape, radius)
     force, time = exact.values(sweeps, table, key, radius)
     covered = key > 0
-    _, bristle = exact.decode(key, b * nodes)
+    stamp, bristle = exact.decode(key, b * nodes)
+    worn = color[bristle] if color.ndim == 2 else color[stamp, bristle]
     dtype = force.dtype
     return TrajectoryMaps(
         pressure=force / FORCE_UNIT,
         sweeps=passes.astype(dtype),
-        color=jnp.where(covered[..., None], color[bristle], 0.0),
+        color=jnp.where(covered[..., None], worn, 0.0),
         time=time,
         coverage=covered.astype(dtype),
         whole=jnp.asarray(True),

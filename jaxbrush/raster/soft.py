@@ -31,7 +31,7 @@ SLACK = 1e-2
 
 @state
 class SoftMaps:
-    """layers: (6, h, w) coverage; force [µN], time, color times coverage. passes: (h, w).
+    """layers: (3 + c, h, w) coverage; force [µN], time, color times coverage. passes: (h, w).
     whole: () bool."""
 
     layers: jax.Array
@@ -89,12 +89,12 @@ def composite(image, keep, add, color, corner, order):
     """Lays windows over an image, one after the other: inside each, image * keep + add.
 
     Args:
-      image: (6, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 3, s, s) to
-        coverage, force and time. color: (n, 3), which comes with coverage. corner: (n, 2) int y, x.
+      image: (3 + c, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 3, s, s) to
+        coverage, force and time. color: (n, c), which comes with coverage. corner: (n, 2) int y, x.
         order: (n,) int, the number of the first window, of the next, ...
 
     Returns:
-      (6, h, w).
+      (3 + c, h, w).
     """
     return _composite_forward(image, keep, add, color, corner, order)[0]
 
@@ -153,8 +153,8 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
     """Soft maps of sweeps (t, b).
 
     Args:
-      sweeps: from `sweeps_of` with threshold -height / 2. color: (b, 3). shape: (h, w).
-      radius, edge: of a bristle and its rim, longest: sweep to reach [pixels], static.
+      sweeps: from `sweeps_of` with threshold -height / 2. color: (b, c) or (t, b, c). shape: (h,
+      w). radius, edge: of a bristle and its rim, longest: sweep to reach [pixels], static.
       height: over which a tip's weight rises [mm].
     """
     reach = radius + 0.5 * edge
@@ -180,11 +180,13 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
         window(x.astype(sweeps.x.dtype)),
         side, radius, edge, height,
     )  # fmt: skip
-    colors = flat(jnp.broadcast_to(color[None], (stamps, count, 3)))
+    channels = color.shape[-1]
+    colors = flat(jnp.broadcast_to(color, (stamps, count, channels)))
     corner = flat(jnp.stack([y, x], axis=-1)) + side
     padded = (shape[0] + 2 * side, shape[1] + 2 * side)
     order = (in_stamp(sweeps) + count * jnp.arange(stamps)[:, None]).reshape(-1)
-    layers = composite(jnp.zeros((6, *padded), keep.dtype), keep, add, colors, corner, order)
+    image = jnp.zeros((3 + channels, *padded), keep.dtype)
+    layers = composite(image, keep, add, colors, corner, order)
     numbers = jax.lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
