@@ -19,7 +19,7 @@ from experiments import evaluation, make_dataset, train_network, training
 from experiments.common import print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import batches, checkpoint, data
-from jaxbrush.models import Generator
+from jaxbrush.models import Generator, inputs_of
 
 KINDS = {1: "height", 3: "color"}
 SHIPPED = Path("checkpoints")
@@ -57,7 +57,7 @@ def with_height(pairs: Pairs, height) -> Pairs:
 
 def milliseconds(exported: checkpoint.Exported, size: int) -> float:
     """Least time of one picture of size x size, warm."""
-    channels = exported.variables["params"]["encode1"]["kernel"].shape[2]
+    channels = inputs_of(exported.config, exported.variables["params"])
     call = jax.jit(lambda v, x: Generator(exported.config).apply(v, x, x[..., :1]))
     x = jnp.zeros((1, size, size, channels))
     times = []

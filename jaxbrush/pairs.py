@@ -220,7 +220,7 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
         "sweeps": track.hairs[0] * maps.sweeps,
         "time": end * maps.time,
         "load": track.load[0] * maps.coverage,
-        "trajectory": maps.coverage[..., None] * to_srgb(jnp.asarray(color, float)),
+        "trajectory": maps.coverage[..., None] * to_srgb(jnp.asarray(color, float))[None, None],
         "picked": maps.color[..., :3],
         "lift": maps.color[..., 3],
         "tip": maps.color[..., 4],

@@ -353,6 +353,27 @@ def test_dtype_is_the_track_s(edge):
         assert dtypes(grid, random_track(0)) == {"float64"}
 
 
+@pytest.mark.parametrize("edge", [None, 0.25])
+def test_what_bristles_carry_may_change_on_the_way(edge):
+    """At each stamp its own: the map tells of the stamp at which the latest bristle came."""
+    track = padded(random_track(4, stamps=20, leap=0.0))
+    stamps, bristles = track.position.shape[0], track.position.shape[-1]
+    still = colors(bristles)
+    every = np.broadcast_to(still, (stamps, bristles, 3))
+    plain, same = (draw(canvas(), track, c, width=WIDTH, edge=edge) for c in (still, every))
+    np.testing.assert_array_equal(plain.color, same.color)
+    time = np.asarray(track.time)
+    share = np.clip((time - time[0]) / (time[19] - time[0]), 0.0, 1.0)
+    maps = draw(canvas(), track, share[:, None, None] * np.ones((1, bristles, 2)), width=WIDTH,
+                edge=edge)  # fmt: skip
+    assert maps.color.shape == (SIDE, SIDE, 2)
+    np.testing.assert_array_equal(maps.color[..., 0], maps.color[..., 1])
+    # When its stamp was, no earlier than it left the pixel and by a stamp at most.
+    late = np.asarray(maps.color[..., 0] - maps.time)
+    assert late.min() > -1e-4 and late.max() < np.diff(share).max() + 1e-4
+    assert np.ptp(np.asarray(maps.time)) > 0.5 and late.max() > 1e-3
+
+
 @pytest.mark.parametrize(
     "values, words",
     [
@@ -365,7 +386,8 @@ def test_dtype_is_the_track_s(edge):
         ({"nodes": 0}, "nodes = 0"),
         ({"nodes": 2}, "nodes = 2"),
         ({"nodes": -1}, "nodes = -1"),
-        ({"color": (1.0, 1.0)}, r"color has shape \(2,\)"),
+        ({"color": 1.0}, r"color has shape \(\)"),
+        ({"color": np.ones((3, 6, 3))}, r"color has shape \(3, 6, 3\)"),
         ({"color": np.ones((5, 3))}, r"color has shape \(5, 3\)"),
     ],
 )

@@ -54,7 +54,8 @@ def _windows(sweeps, earlier, y, x, side, radius, edge, height):
     """What sweeps (n, 1, 1) do to windows at y, x (n, 1, 1).
 
     Returns:
-      keep (n, s, s); add (n, 3, s, s) of coverage, force, time; passes (n, s, s).
+      keep (n, s, s); add (n, 4, s, s) of coverage by this sweep and, taken back, by the one before,
+      of force, time; passes (n, s, s).
     """
     index = jnp.arange(side, dtype=sweeps.x.dtype)
     py, px = y + index[None, :, None], x + index[None, None, :]
@@ -71,7 +72,7 @@ def _windows(sweeps, earlier, y, x, side, radius, edge, height):
     force = force + then * (earlier.press + back * earlier.gain)
     time = now * (sweeps.time + share * sweeps.span)
     time = time + then * (earlier.time + back * earlier.span)
-    return keep, jnp.stack([now + then, force, time], axis=1), jnp.maximum(a - old, 0.0)
+    return keep, jnp.stack([now, then, force, time], axis=1), jnp.maximum(a - old, 0.0)
 
 
 def in_stamp(sweeps: Sweeps):
@@ -85,18 +86,18 @@ def in_stamp(sweeps: Sweeps):
 
 
 @jax.custom_vjp
-def composite(image, keep, add, color, corner, order):
+def composite(image, keep, add, color, earlier, corner, order):
     """Lays windows over an image, one after the other: inside each, image * keep + add.
 
     Args:
-      image: (3 + c, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 3, s, s) to
-        coverage, force and time. color: (n, c), which comes with coverage. corner: (n, 2) int y, x.
-        order: (n,) int, the number of the first window, of the next, ...
+      image: (3 + c, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 4, s, s) to
+        coverage twice, force and time. color, earlier: (n, c), which come with the one and the
+        other coverage. corner: (n, 2) int y, x. order: (n,) int, the number of the first window, of the next, ...
 
     Returns:
       (3 + c, h, w).
     """
-    return _composite_forward(image, keep, add, color, corner, order)[0]
+    return _composite_forward(image, keep, add, color, earlier, corner, order)[0]
 
 
 def _run(image, corner, order, side, change, backwards=False):
@@ -125,25 +126,31 @@ def _run(image, corner, order, side, change, backwards=False):
     return jax.lax.fori_loop(0, count, step, (image, seen))
 
 
-def _composite_forward(image, keep, add, color, corner, order):
+def _composite_forward(image, keep, add, color, earlier, corner, order):
     def change(i, old):
-        paint = color[i][:, None, None] * add[i, :1]
-        return old * keep[i][None] + jnp.concatenate([add[i], paint])
+        paint = color[i][:, None, None] * add[i, :1] + earlier[i][:, None, None] * add[i, 1:2]
+        new = jnp.concatenate([add[i, :1] + add[i, 1:2], add[i, 2:], paint])
+        return old * keep[i][None] + new
 
     image, old = _run(image, corner, order, keep.shape[-1], change)
-    return image, (keep, add, color, old, corner, order)
+    return image, (keep, add, color, earlier, old, corner, order)
 
 
 def _composite_backward(saved, slope):
-    keep, add, color, old, corner, order = saved
+    keep, add, color, earlier, old, corner, order = saved
     change = lambda i, slope: slope * keep[i][None]  # noqa: E731
     slope, by = _run(slope, corner, order, keep.shape[-1], change, backwards=True)
     by_keep = jnp.sum(by * old, axis=1)
-    by_color = jnp.einsum("ncyx,nyx->nc", by[:, 3:], add[:, 0], precision="highest")
-    by_paint = jnp.einsum("ncyx,nc->nyx", by[:, 3:], color, precision="highest")
-    by_add = jnp.concatenate([by[:, :1] + by_paint[:, None], by[:, 1:3]], axis=1)
+    by_colors = [
+        jnp.einsum("ncyx,nyx->nc", by[:, 3:], add[:, k], precision="highest") for k in (0, 1)
+    ]
+    by_cover = [
+        by[:, :1] + jnp.einsum("ncyx,nc->nyx", by[:, 3:], c, precision="highest")[:, None]
+        for c in (color, earlier)
+    ]
+    by_add = jnp.concatenate([*by_cover, by[:, 1:3]], axis=1)
     none = (np.zeros(number.shape, jax.dtypes.float0) for number in (corner, order))
-    return slope, by_keep, by_add, by_color, *none
+    return slope, by_keep, by_add, *by_colors, *none
 
 
 composite.defvjp(_composite_forward, _composite_backward)
@@ -181,12 +188,13 @@ def maps(sweeps: Sweeps, color, shape, radius, edge, height, longest) -> SoftMap
         side, radius, edge, height,
     )  # fmt: skip
     channels = color.shape[-1]
-    colors = flat(jnp.broadcast_to(color, (stamps, count, channels)))
+    colors = jnp.broadcast_to(color, (stamps, count, channels))
+    earlier = jnp.concatenate([colors[:1], colors[:-1]])
     corner = flat(jnp.stack([y, x], axis=-1)) + side
     padded = (shape[0] + 2 * side, shape[1] + 2 * side)
     order = (in_stamp(sweeps) + count * jnp.arange(stamps)[:, None]).reshape(-1)
     image = jnp.zeros((3 + channels, *padded), keep.dtype)
-    layers = composite(image, keep, add, colors, corner, order)
+    layers = composite(image, keep, add, flat(colors), flat(earlier), corner, order)
     numbers = jax.lax.ScatterDimensionNumbers(
         update_window_dims=(1, 2), inserted_window_dims=(), scatter_dims_to_operand_dims=(0, 1)
     )
