@@ -35,7 +35,7 @@ class Config:
     """A data set of training pairs; goes on where an earlier run stopped."""
 
     preset: Literal["tiny", "cpu", "small", "paper"] = "tiny"
-    """200 + 40 or 800 + 112 pairs of 128 x 128, 1,000 + 125 of 256 x 256, or 10,000 + 1,000 of
+    """160 + 40 or 800 + 112 pairs of 128 x 128, 1,000 + 125 of 256 x 256, or 10,000 + 1,000 of
     512 x 512."""
     out: Path | None = None
     """Folder of the set [default: results/data_<preset>]."""

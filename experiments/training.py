@@ -17,7 +17,7 @@ from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 from experiments import evaluation
 from experiments.common import console, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
-from jaxbrush import checkpoint
+from jaxbrush import checkpoint, mixing
 from jaxbrush.batches import recolored
 from jaxbrush.models import DiscriminatorConfig, GeneratorConfig, folded, inputs_of
 from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
@@ -176,8 +176,11 @@ def make_batches(pairs: Pairs, options: Options, kind: str = "height"):
 
 
 def sample_grid(kind: str, found, pairs: Pairs, path: Path):
-    """Saves a row a pair: background, the stroke's map, network, truth, difference times 4."""
-    stroke = pairs.batch.inputs[..., OUTPUTS[kind] :][..., : OUTPUTS[kind]]
+    """Saves a row a pair: background, map of the stroke (of colors that mix, what bristles carry),
+    network, truth, difference times 4."""
+    inputs, count = pairs.batch.inputs, OUTPUTS[kind]
+    first = mixing.COLORS - 3 if kind == "color" and inputs.shape[-1] > mixing.COLORS else count
+    stroke = inputs[..., first : first + count]
     difference = np.abs(np.asarray(found) - np.asarray(pairs.batch.target)) * 4.0 - 1.0
     columns = (pairs.background, stroke, found, pairs.batch.target, difference)
     tiles = []

@@ -55,6 +55,11 @@ def composite(canvas: Canvas, patch: Canvas, mask, corner) -> Canvas:
     )
 
 
+def _power(base, exponent: float):
+    """Of a positive base: a third of the time that XLA's CPU backend takes for `**`."""
+    return jnp.exp(exponent * jnp.log(base))
+
+
 def mix_linear(shares, palette):
     """Mean of the pigments' colors, as lights mix: (..., k) shares, (k, 3) palette to (..., 3)."""
     return jnp.matmul(shares, palette, precision=jax.lax.Precision.HIGHEST)
@@ -68,13 +73,13 @@ def absorbed(color, exponent: float = 0.35):
     a smaller exponent is closer to what paint from tubes does.
     """
     reflectance = jnp.clip(color, 1e-3, 0.999)
-    return ((1.0 - reflectance) ** 2 / (2.0 * reflectance)) ** exponent
+    return _power(jnp.square(1.0 - reflectance) / (2.0 * reflectance), exponent)
 
 
 def reflected(mean, exponent: float = 0.35):
     """Inverse of `absorbed`, on [1e-3, 0.999]."""
     # A pixel without paint has no ratio; the bound keeps its slope finite.
-    mixed = jnp.maximum(mean, 1e-8) ** (1.0 / exponent)
+    mixed = _power(jnp.maximum(mean, 1e-8), 1.0 / exponent)
     # As a quotient: the difference of the same terms cancels where it is dark.
     return 1.0 / (1.0 + mixed + jnp.sqrt(mixed * mixed + 2.0 * mixed))
 
@@ -126,11 +131,11 @@ def flatten(paint, layer, palette, opacity=0.03, ground=LINEN, mixing: str = "li
 def to_srgb(linear):
     """Linear RGB in [0, 1] to sRGB (IEC 61966-2-1), differentiable at 0."""
     x = jnp.clip(linear, 0.0, 1.0)
-    high = 1.055 * jnp.maximum(x, 0.0031308) ** (1.0 / 2.4) - 0.055
+    high = 1.055 * _power(jnp.maximum(x, 0.0031308), 1.0 / 2.4) - 0.055
     return jnp.where(x <= 0.0031308, 12.92 * x, high)
 
 
 def from_srgb(srgb):
     """sRGB in [0, 1] to linear RGB."""
     x = jnp.clip(srgb, 0.0, 1.0)
-    return jnp.where(x <= 0.04045, x / 12.92, ((x + 0.055) / 1.055) ** 2.4)
+    return jnp.where(x <= 0.04045, x / 12.92, _power((x + 0.055) / 1.055, 2.4))

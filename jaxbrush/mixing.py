@@ -32,9 +32,9 @@ def mix(logits, inputs):
     Returns:
       (n, h, w, 3) sRGB in [-1, 1].
     """
-    canvas, brush, picked = (
-        absorbed(from_srgb(0.5 * (inputs[..., k : k + 3] + 1.0))) for k in (0, 3, 6)
-    )
+    # All at once: apart, XLA would work them out again for each of the places.
+    colors = absorbed(from_srgb(0.5 * (inputs[..., :COLORS] + 1.0)))
+    canvas, brush, picked = jnp.split(colors, 3, axis=-1)
     shares = jax.nn.softmax(logits, axis=-1)
     mean = shares[..., :1] * brush + shares[..., 1:2] * picked
     h, w = canvas.shape[1:3]

@@ -89,7 +89,8 @@ def test_a_stroke_changes_its_mask_and_is_the_next_background(folder):
     assert (changed * (1.0 - p["mask"])).sum() < 0.01 * changed.sum()
     assert p["mask"].mean() < 0.9
     np.testing.assert_array_equal(p["new_height"][0], p["height"][1])
-    np.testing.assert_array_equal(p["new_color"][0], p["color"][1])
+    # Compiled twice, and a step of what is stored apart at most.
+    np.testing.assert_allclose(p["new_color"][0], p["color"][1], atol=1.5 / data.FULL)
     assert p["height"][0].max() == 0.0
     # Where no bristle came, the maps are empty.
     bare = p["mask"] == 0.0
@@ -215,8 +216,8 @@ def test_long_strokes_fit_their_stamps():
 
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
-    for kind, outputs, channels in (("height", 1, 5), ("color", 3, 8)):
-        options = GeneratorConfig(outputs, width=0.05)
+    for kind, outputs, channels in (("height", 1, 6), ("color", 3, 15)):
+        options = GeneratorConfig(outputs, width=0.05, mixes=kind == "color")
         variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
         checkpoint.export(weights[-1], options, variables, {"command": "a test"})
@@ -225,8 +226,9 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     for path in weights:
         rows = found[str(path)]["errors"]
         assert rows["the simulator"]["rmse_masked"] == 0.0
-        # A network that has learned nothing paints gray.
-        assert rows["the network"]["rmse_whole"] > rows["copy the background"]["rmse_whole"]
+        # A height network that has learned nothing paints gray; one that mixes cannot.
+        if path == weights[0]:
+            assert rows["the network"]["rmse_whole"] > rows["copy the background"]["rmse_whole"]
         assert (tmp_path / f"{path.stem}.png").stat().st_size > 500
     color = found[str(weights[1])]["errors"]
     assert color["on predicted height"]["delta_e"] != color["the network"]["delta_e"]
@@ -236,7 +238,7 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     options = GeneratorConfig(1, width=0.05)
     other = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, 3)))
     checkpoint.export(tmp_path / "other.npz", options, other, {})
-    with pytest.raises(SystemExit, match="other.npz: a network of 3 inputs: expected 5"):
+    with pytest.raises(SystemExit, match="other.npz: a network of 3 inputs: expected 6"):
         evaluate.main(evaluate.Config((tmp_path / "other.npz",), data=folder, out=tmp_path))
     (tmp_path / "broken.npz").write_bytes(b"weights")
     with pytest.raises(SystemExit, match="broken.npz"):
@@ -287,7 +289,7 @@ def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
 def test_predicted_heights_are_laid_as_in_use(folder):
     found = data.load(folder)
     config = GeneratorConfig(outputs=1, width=0.05)
-    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 5)))
+    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 6)))
     network = checkpoint.Exported(variables, config, {})
     index = np.arange(found.count("train"))
     heights = train_network.predicted_heights(found, "train", index, network)

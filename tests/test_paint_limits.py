@@ -232,7 +232,7 @@ def test_drift_does_not_grow_over_500_strokes():
 @pytest.mark.slow
 def test_jit_equals_op_by_op():
     config = PaintConfig(
-        layers=5, window=12, pigments=2, samples=1, sweeps=1, viscous=2, pressure=2
+        layers=5, window=12, pigments=2, samples=1, viscous=2, pressure=2, spectrum=0.9
     )
     params = params_of()
     moves = jax.tree.map(lambda a: a[:2], track(x=1.0, y=1.0, low=-0.2))

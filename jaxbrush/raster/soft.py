@@ -92,7 +92,8 @@ def composite(image, keep, add, color, earlier, corner, order):
     Args:
       image: (3 + c, h, w) coverage, force, time, color. keep: (n, s, s). add: (n, 4, s, s) to
         coverage twice, force and time. color, earlier: (n, c), which come with the one and the
-        other coverage. corner: (n, 2) int y, x. order: (n,) int, the number of the first window, of the next, ...
+        other coverage. corner: (n, 2) int y, x. order: (n,) int, the number of the first window, of
+        the next, ...
 
     Returns:
       (3 + c, h, w).
