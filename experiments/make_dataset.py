@@ -22,7 +22,7 @@ import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
 from experiments.common import console, print_table
-from jaxbrush import data
+from jaxbrush import batches, data
 from jaxbrush.canvas import Canvas, from_srgb
 from jaxbrush.render import picture, shade
 
@@ -166,7 +166,8 @@ def sheet(found: data.Dataset, path: Path) -> None:
         lit = picture(shade(after, pixel))
         rows.append(np.hstack([
             gray(p["height"] / 0.8), p["color"], gray(np.sqrt(p["pressure"] / 4.0)),
-            p["trajectory"], gray(p["time"] / max(p["time"].max(), 1e-6)),
+            gray(p["tip"] / batches.LEVELS["tip"]), p["trajectory"], p["picked"],
+            gray(p["time"] / max(p["time"].max(), 1e-6)),
             gray(p["new_height"] / 0.8), p["new_color"], np.asarray(lit) / 255.0,
         ]))  # fmt: skip
     image = (255.0 * np.vstack(rows)[..., ::-1]).astype(np.uint8)
