@@ -89,7 +89,7 @@ def trajectory_maps(
     if color.ndim == 1:
         color = jnp.broadcast_to(color, (b, *color.shape))
     # Each node that draws is a bristle of its own, of the same color.
-    color = jnp.concatenate([color] * nodes, axis=-2)
+    color = jnp.tile(color, (nodes, 1))
     exact.check_keys(stamps, b * nodes)
     if edge is not None:
         return _soft(grid, track, color, width, edge, nodes, longest)
