@@ -91,7 +91,7 @@ def settings(options: Config) -> list[Setting]:
     found.append(
         Setting("heightfield", "films", "heightfield", heightfield_config(pigments=2), GRID)
     )
-    weak = {"viscous": 1, "pressure": 2, "sweeps": 1}
+    weak = {"viscous": 1, "pressure": 2}
     vary("interval", "1 px")
     vary("interval", "4 px", 4 * GRID)
     vary("interval", "4 px, 1 + 2 rounds", 4 * GRID, **weak)
@@ -102,11 +102,12 @@ def settings(options: Config) -> list[Setting]:
     vary("interval", "1 px, 1 + 2 rounds", **weak)
     vary("interval", "4 px, 4 points a way", 4 * GRID, sweeps=4)
     vary("iterations", "3 + 5", viscous=3, pressure=5)
-    vary("iterations", "12 + 20", viscous=12, pressure=20)
+    vary("iterations", "6 + 10", viscous=6, pressure=10, spectrum=0.9)
+    vary("iterations", "18 + 40", viscous=18, pressure=40)
     vary("solver", "line PCG 8", solver="zline_pcg", pressure=8)
     vary("solver", "line PCG 5", solver="zline_pcg", pressure=5)
-    vary("solver", "Jacobi PCG 10", solver="jacobi_pcg")
-    vary("solver", "fixed point 10", solver="fixed_point")
+    vary("solver", "Jacobi PCG 20", solver="jacobi_pcg")
+    vary("solver", "fixed point 20", solver="fixed_point")
     vary("layers", "1/8 mm", layer=0.125, layers=8)
     vary("layers", "1/8 mm, 1/2 px", GRID / 2, layer=0.125, layers=8)
     vary("pixel", "1/4 mm", 2 * GRID, pixel=0.25, window=32)
@@ -192,7 +193,7 @@ def chart(points: list[dict], results: dict, options: Config, path: Path):
     panels[0].set(ylabel="time for a millimetre of stroke [ms]", title="Speed against accuracy")
     panels[0].legend(fontsize=8, loc="lower left", bbox_to_anchor=(0.0, 0.08))
     axis = panels[2]
-    kinds = {"": "6 + 10 rounds", ", 1 + 2 rounds": "1 + 2 rounds, one point a way"}
+    kinds = {"": "9 + 20 rounds", ", 1 + 2 rounds": "1 + 2 rounds"}
     for (rounds, label), color in zip(kinds.items(), COLORS[1::-1], strict=True):
         mine = [p for p in points if p["name"] in [f"interval {n} px{rounds}" for n in (2, 4)]]
         mine.sort(key=lambda p: p["spacing"])

@@ -24,11 +24,11 @@ SPACINGS = (0.0625, 0.125, 0.25, 0.5, 1.0)  # [mm]
 ROWS = (
     ("1 + 2 rounds", {"viscous": 1, "pressure": 2}),
     ("3 + 5", {"viscous": 3, "pressure": 5}),
-    ("6 + 10", {}),
-    ("12 + 20", {"viscous": 12, "pressure": 20}),
-    ("6 + 10, line PCG", {"solver": "zline_pcg"}),
-    ("6 + 10, Jacobi PCG", {"solver": "jacobi_pcg"}),
-    ("6 + 10, fixed point", {"solver": "fixed_point"}),
+    ("9 + 20", {}),
+    ("18 + 40", {"viscous": 18, "pressure": 40}),
+    ("9 + 20, line PCG", {"solver": "zline_pcg"}),
+    ("9 + 20, Jacobi PCG", {"solver": "jacobi_pcg"}),
+    ("9 + 20, fixed point", {"solver": "fixed_point"}),
 )
 SHOWN = (30.0, 300.0)
 """Errors [µm] between which the map's colors change."""

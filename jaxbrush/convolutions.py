@@ -10,6 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax import lax
 
+from jaxbrush import winograd
+
 KERNEL = 4
 """Side of every kernel (paper, appendix)."""
 
@@ -102,6 +104,34 @@ def _backward(saved, slope):
 
 _convolve.defvjp(_forward, _backward)
 
+WIDE = 96
+"""Channels on both sides from which fewer products pay for the sums that they take."""
+
+
+@jax.custom_vjp
+def _convolve_wide(x, kernel):
+    return lax.platform_dependent(x, kernel, cpu=winograd.convolve, default=_valid)
+
+
+def _forward_wide(x, kernel):
+    return _convolve_wide(x, kernel), (x, kernel)
+
+
+def _backward_wide(saved, slope):
+    return lax.platform_dependent(
+        *saved, slope, cpu=winograd.slopes, default=lambda x, k, s: jax.vjp(_valid, x, k)[1](s)
+    )
+
+
+_convolve_wide.defvjp(_forward_wide, _backward_wide)
+
+
+def _dense(x, kernel, fast: bool):
+    side, _, ins, outs = kernel.shape
+    # Sums of bfloat16 would lose what the products keep.
+    fast = fast and side > 2 and min(ins, outs) >= WIDE and x.dtype == jnp.float32
+    return (_convolve_wide if fast else _convolve)(x, kernel)
+
 
 def blocks_to_channels(x):
     """(n, 2h, 2w, c) to (n, h, w, 4c), channels in the order y, x, c."""
@@ -117,13 +147,15 @@ def channels_to_blocks(x):
     return x.reshape(n, 2 * h, 2 * w, c // 4)
 
 
-def convolve(x, kernel, stride: int = 1):
+def convolve(x, kernel, stride: int = 1, fast: bool = False):
     """Convolution that keeps the size, or halves it.
 
     Args:
       x: (n, h, w, i), zero outside; h and w even where stride is 2.
       kernel: (4, 4, i, o), of x's dtype.
       stride: 1 (padded by 1 before and 2 after) or 2 (by 1 on both sides).
+      fast: whether a CPU may take fewer products where there are many channels (`winograd`): equal
+        to 2e-6 of the result's spread, but not bit for bit between patches and the whole.
 
     Returns:
       (n, h / stride, w / stride, o). Differentiable by reverse mode, any number of times.
@@ -132,7 +164,7 @@ def convolve(x, kernel, stride: int = 1):
       ValueError: any other stride, or an odd size with stride 2.
     """
     if stride == 1:
-        return _convolve(_pad(x, 1, 2), kernel)
+        return _dense(_pad(x, 1, 2), kernel, fast)
     if stride != 2 or x.shape[1] % 2 or x.shape[2] % 2:
         raise ValueError(
             f"stride = {stride} on a picture of {x.shape[1:3]}: expected 1, or 2 and even sides"
@@ -142,7 +174,7 @@ def convolve(x, kernel, stride: int = 1):
     return _convolve(blocks_to_channels(_pad(x, 1, 1)), blocks.reshape(2, 2, 4 * ins, outs))
 
 
-def convolve_up(x, kernel, upsampling: str = "resize"):
+def convolve_up(x, kernel, upsampling: str = "resize", fast: bool = False):
     """Convolution that doubles the size, computed on the small picture.
 
     The four output pixels of an input pixel are channels of one convolution of kernel 3, whose
@@ -152,6 +184,7 @@ def convolve_up(x, kernel, upsampling: str = "resize"):
       x: (n, h, w, i), zero outside. kernel: (4, 4, i, o), of x's dtype.
       upsampling: "resize" repeats each pixel and convolves (Odena et al. 2016); "transposed" is the
         adjoint of `convolve` with stride 2, the kernel's last two axes swapped.
+      fast: as in `convolve`.
 
     Returns:
       (n, 2h, 2w, o). Differentiable by reverse mode, any number of times.
@@ -164,4 +197,5 @@ def convolve_up(x, kernel, upsampling: str = "resize"):
     ins, outs = kernel.shape[2:]
     sums = jnp.asarray(UPSAMPLING[upsampling], kernel.dtype)
     kernel = jnp.einsum("pak,qbl,klio->abipqo", sums, sums, kernel, precision=lax.Precision.HIGHEST)
-    return channels_to_blocks(_convolve(_pad(x, 1, 1), kernel.reshape(3, 3, ins, 4 * outs)))
+    kernel = kernel.reshape(3, 3, ins, 4 * outs)
+    return channels_to_blocks(_dense(_pad(x, 1, 1), kernel, fast))

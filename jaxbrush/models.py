@@ -169,9 +169,9 @@ class Conv(nn.Module):
         kernel = self.param("kernel", self.start, (KERNEL, KERNEL, x.shape[-1], self.channels))
         kernel = kernel.astype(self.dtype)
         if self.upsampling:
-            x = convolve_up(x, kernel, self.upsampling)
+            x = convolve_up(x, kernel, self.upsampling, fast=train)
         else:
-            x = convolve(x, kernel, self.stride)
+            x = convolve(x, kernel, self.stride, fast=train)
         if self.norm != "none":
             return Norm(self.norm, self.dtype, name="norm")(x, weights, pooled, train)
         bias = self.param("bias", nn.initializers.zeros, (self.channels,))
@@ -203,7 +203,8 @@ class Generator(nn.Module):
       weights: (n, h, w, 1) of the pixels in the moments of "instance" (optional) and "masked".
       pooled: whether the batch holds patches of one stroke that share their moments; a pixel that
         is in several patches has to share its weight among them.
-      train: batch moments in place of their running averages, which `mutable=["moments"]` returns.
+      train: batch moments in place of their running averages, which `mutable=["moments"]` returns;
+        and on a CPU the fewer products of `winograd` in wide layers.
 
     Returns:
       (n, h, w, outputs) float32 in [-1, 1].
