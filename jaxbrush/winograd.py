@@ -26,10 +26,10 @@ def transforms(side: int):
       (collect (side + 1, 2), kernel (side + 1, side), picture (side + 1, side + 1)), float32.
 
     Raises:
-      ValueError: a side other than 2 to 4.
+      ValueError: a side other than 3 or 4.
     """
-    if not 2 <= side <= len(POINTS):
-        raise ValueError(f"side = {side}: expected 2 to {len(POINTS)}")
+    if side not in (3, 4):
+        raise ValueError(f"side = {side}: expected 3 or 4")
 
     def powers(count):
         finite = [[p**j for j in range(count)] for p in POINTS[:side]]
@@ -110,7 +110,7 @@ def convolve(x, kernel):
     """Convolution without padding.
 
     Args:
-      x: (n, h, w, i), of sides not below the kernel's. kernel: (k, k, i, o), k of 2 to 4.
+      x: (n, h, w, i), of sides not below the kernel's. kernel: (k, k, i, o), k of 3 or 4.
 
     Returns:
       (n, h - k + 1, w - k + 1, o).

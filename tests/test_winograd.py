@@ -26,7 +26,7 @@ def off(a, b):
     return np.sqrt(np.mean((a - b) ** 2) / np.mean(b**2))
 
 
-@pytest.mark.parametrize("side", [2, 3, 4])
+@pytest.mark.parametrize("side", [3, 4])
 def test_the_matrices_are_those_of_a_correlation(side):
     collect, kernel, picture = (m.astype(np.float64) for m in winograd.transforms(side))
     rng = np.random.default_rng(side)
@@ -36,12 +36,12 @@ def test_the_matrices_are_those_of_a_correlation(side):
 
 
 def test_another_side_is_refused():
-    with pytest.raises(ValueError, match="side = 5: expected 2 to 4"):
+    with pytest.raises(ValueError, match="side = 5: expected 3 or 4"):
         winograd.transforms(5)
 
 
-@pytest.mark.parametrize("side", [2, 3, 4])
-@pytest.mark.parametrize("size", [(1, 1), (6, 9), (7, 4)])
+@pytest.mark.parametrize("side", [3, 4])
+@pytest.mark.parametrize("size", [(1, 1), (6, 9)])
 def test_results_and_slopes_equal_the_wide(side, size):
     """Odd and even sizes, and one pixel. float32 against float64's plain sums would be 3e-7."""
     h, w = (s + side - 1 for s in size)

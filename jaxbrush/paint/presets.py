@@ -1,7 +1,7 @@
 """Settings of the simulator worth a name, each (PaintConfig, PaintParams, stamp spacing [mm]).
 
 The numbers are of `python -m experiments.paint_accuracy`: 9 mm of a 4.5 mm flat brush over a wet
-band, against `reference`; times are of 2 cores, a slow machine's and a fast one's.
+band, against `reference`, on 2 cores with AVX2 (150 GFLOP/s in matrix products).
 """
 
 from jaxbrush.paint.state import PaintConfig, PaintParams, for_brush, make_params
@@ -17,27 +17,25 @@ def params_of(bristles: int = REAL) -> PaintParams:
 
 
 def offline(bristles: int = REAL) -> tuple[PaintConfig, PaintParams, float]:
-    """What data are made with: 19 or 4.6 ms a stamp, 0.4 or 0.1 s a millimetre; 64 um rms, 1.7
-    Delta E, in a film of 300 um, and 13 % less paint laid.
+    """What data are made with: 11 ms a stamp, 0.24 s a millimetre; 43 um rms, 1.3 Delta E, in a
+    film of 309 um, and 13 % less paint laid.
 
-    The interval of the stamps counts most: at a whole pixel 112 um and 3.6, for half the time; at
-    two 180 um and 5.9. To stamps without end the error falls by the power 1.2 of their interval.
-    Cells twice as high, 75 um and 2.6, halve the time. Twice the rounds, 38 um and 5 % less paint,
-    at 1.6 times the cost; half of them, 84 um; 1 + 2 lay 29 % more than the reference, 198 um. On a
-    wet canvas the pressure keeps half of its error (residual 18 %), with 8 rounds of line PCG 17
-    %, at twice the cost, for 56 um in place of 64.
+    The interval of the stamps counts most: at a whole pixel 134 um and 4.1, for half the time; at
+    two 200 um and 6.3. Cells twice as high take 0.6 of the time, for 33 um and 1.7. At this
+    interval 3 + 5 rounds leave 101 um, 1 + 2 lay 19 % more than the reference, 190 um; 18 + 40
+    change nothing (52 um). The other solvers at as many rounds come to 41 to 54 um.
     """
     return PaintConfig(), params_of(bristles), 0.0625
 
 
 def realtime(bristles: int = REAL // 2) -> tuple[PaintConfig, PaintParams, float]:
-    """The fastest that still shows the grooves and no beads: 0.7 or 0.3 ms a stamp, 4.1 or 1.6 ms
-    a millimetre with 130 bristles; 117 um rms, 4.0 Delta E.
+    """The fastest that still shows the grooves and no beads: 0.6 ms a stamp, 3.4 ms a millimetre
+    with 130 bristles; 142 um rms, 3.9 Delta E.
 
     Pixels of 0.25 mm and as much between stamps, cells 0.2 mm high, 2 + 3 rounds, fluxes without
-    limiter: at this interval it sharpens nothing. Stamps 0.375 mm apart save a quarter: 170 um, 4.7
-    Delta E; at 0.5 mm, with 65 bristles, grooves come out as bumps: 185 um, 7.1. With 90 bristles
-    5.0 Delta E for the same time.
+    limiter: at this interval it sharpens nothing. At 0.5 mm, with 65 bristles, grooves come out as
+    bumps. The same pixels and interval with the rest as in `offline` cost six times as much, for
+    147 um and 3.3.
     """
     config = PaintConfig(
         pixel=0.25, layer=0.2, layers=5, window=24, samples=2, sweeps=1, viscous=2, pressure=3,
