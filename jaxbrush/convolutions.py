@@ -104,7 +104,7 @@ def _backward(saved, slope):
 
 _convolve.defvjp(_forward, _backward)
 
-WIDE = 96
+WIDE = 128
 """Channels on both sides from which fewer products pay for the sums that they take."""
 
 
@@ -155,7 +155,7 @@ def convolve(x, kernel, stride: int = 1, fast: bool = False):
       kernel: (4, 4, i, o), of x's dtype.
       stride: 1 (padded by 1 before and 2 after) or 2 (by 1 on both sides).
       fast: whether a CPU may take fewer products where there are many channels (`winograd`): equal
-        to 2e-6 of the result's spread, but not bit for bit between patches and the whole.
+        to 3e-6 of the result's spread, but not bit for bit between patches and the whole.
 
     Returns:
       (n, h / stride, w / stride, o). Differentiable by reverse mode, any number of times.

@@ -2,9 +2,9 @@
 
 Two by two output pixels of a kernel of side k take (k + 1)^2 products per pair of channels in place
 of 4 k^2: 2.25 times fewer for k = 3, 2.56 for k = 4. What pixels and kernels are turned into are
-sums with small factors: the result is the plain convolution's to 1e-6 or 2e-6 of its spread in
-float32. A pixel's rounding depends on its place in a tile, so patches of a picture do not come out
-as the whole does to the last bit.
+sums with small factors: results and slopes are the plain convolution's to 1e-6 to 3e-6 of their
+spread in float32. A pixel's rounding depends on its place in a tile, so patches of a picture do not
+come out as the whole does to the last bit.
 """
 
 import functools
@@ -61,7 +61,7 @@ def _both(matrix, terms):
 
 
 def _every(x, begin, count):
-    """x (n, h, w, c) at every second row and column from `begin`, as (n count, c)."""
+    """x (n, h, w, c) at every second row and column from `begin`: (n, *count, c)."""
     (y, x0), (rows, columns) = begin, count
     return x[:, y : y + TILE * (rows - 1) + 1 : TILE, x0 : x0 + TILE * (columns - 1) + 1 : TILE]
 
