@@ -13,7 +13,10 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from jaxbrush.platform import keep_memory
+
 matplotlib.use("Agg")
+keep_memory()
 
 # Tables need the width where nobody watches, too.
 console = Console(width=None if sys.stdout.isatty() else 120)

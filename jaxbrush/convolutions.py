@@ -64,9 +64,9 @@ def _kernel_slope_products(x, kernel, slope):
         )  # fmt: skip
 
     # Loops, because each product in a row of them would be compiled by itself.
-    if k * channels <= 256 or k * k * channels <= 512:
+    if k * channels <= 256:
         wide = jnp.concatenate([moving[:, :, x : x + w] for x in starts], axis=-1)
-        if k * k * channels <= 512:
+        if k * k * channels <= 256:
             wide = jnp.concatenate([wide[:, y : y + h] for y in starts], axis=-1)
             slopes = product(wide)[None]
         else:

@@ -1,9 +1,11 @@
-"""Refuses the JAX releases that compute wrong numbers, or compute them far too slowly.
+"""Refuses the JAX releases that compute wrong numbers, or compute them far too slowly; and keeps
+the memory of a process, which speeds up training on a CPU.
 
 `pyproject.toml` excludes the same releases; this check also catches an environment that
 was put together by other means. `tests/test_backend.py` holds the reproducers.
 """
 
+import ctypes
 import re
 
 import jax
@@ -54,3 +56,25 @@ def check_jax_version(version: str | None = None) -> None:
     else:
         return
     raise ImportError(f"jaxbrush does not run on jax {version}: {reason}. {REMEDY}")
+
+
+_TRIM_THRESHOLD, _MMAP_THRESHOLD, _ARENA_MAX = -1, -3, -8  # of glibc's malloc.h
+
+
+def keep_memory() -> bool:
+    """Has the process keep the memory that it frees, from then on.
+
+    glibc hands blocks above 32 MiB back to the system and is given them again page by page: one
+    page fault per 4 KiB of XLA's working memory at every call. Without, a training step of small
+    networks takes two thirds of the time (2 cores). The process stays as large as it once was.
+
+    Returns:
+      Whether the C library could be told; only glibc can.
+    """
+    try:
+        tell = ctypes.CDLL(None).mallopt
+    except (OSError, AttributeError, TypeError):
+        return False
+    # Arenas of other threads hold 64 MiB, and ask the system for larger blocks: one arena for all.
+    settings = {_MMAP_THRESHOLD: 2**30, _TRIM_THRESHOLD: 2**31 - 1, _ARENA_MAX: 1}
+    return all([tell(name, value) == 1 for name, value in settings.items()])
