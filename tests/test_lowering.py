@@ -6,7 +6,11 @@ there, and calls of libraries, which differ from platform to platform, are found
 
 import dataclasses
 import functools
+import importlib.util
+import json
 import re
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -139,3 +143,29 @@ def test_training(dtype):
     )  # fmt: skip
     state = jax.eval_shape(init, jax.random.key(0), batch, make_rates())
     assert not lowers(update, state, batch)
+
+
+def compile_gpu(*options):
+    command = [sys.executable, "-m", "experiments.compile_gpu", *map(str, options)]
+    return subprocess.run(command, capture_output=True, text=True, check=False)
+
+
+@pytest.mark.slow
+def test_every_stage_compiles_for_a_gpu(tmp_path):
+    pytest.importorskip("jax_plugins.xla_cuda12", reason="NVIDIA's plugin for JAX")
+    done = compile_gpu("--quick", "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    stages = json.loads((tmp_path / "metrics.json").read_text())["stages"]
+    assert len(stages) == 8 and all(s["kernels"] > 0 for s in stages)
+    # bfloat16 holds pictures in half the memory.
+    full, half = (s["working"] for s in stages[-2:])
+    assert half < 0.75 * full
+
+
+def test_without_the_plugin_it_is_said_what_to_install(tmp_path):
+    if importlib.util.find_spec("jax_plugins") is not None:
+        pytest.skip("a plugin is installed")
+    done = compile_gpu("--quick", "--out", tmp_path / "made")
+    assert done.returncode == 1
+    assert "pip install --no-deps jax-cuda12-plugin==" in done.stderr
+    assert not (tmp_path / "made").exists()
