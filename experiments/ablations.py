@@ -46,9 +46,12 @@ VARIANTS = {
     "height": _BOTH | {
         "no load": {"load": False},
         "no height of the tips": {"tip": False},
+        "no film": {"film": False},
         "no sweep count": {"hand": "pressure"},
         "no pressure": {"hand": "sweeps"},
-        "the paper's maps": {"hand": "pressure", "time": False, "load": False, "tip": False},
+        "the paper's maps": {
+            "hand": "pressure", "time": False, "load": False, "tip": False, "film": False,
+        },
     },
     "color": _BOTH | {
         "no new height": {"height": False}, "no recoloring": {"recolor": False},

@@ -166,7 +166,8 @@ def sheet(found: data.Dataset, path: Path) -> None:
         lit = picture(shade(after, pixel))
         rows.append(np.hstack([
             gray(p["height"] / 0.8), p["color"], gray(np.sqrt(p["pressure"] / 4.0)),
-            gray(p["tip"] / batches.LEVELS["tip"]), p["trajectory"], p["picked"],
+            gray(p["tip"] / batches.LEVELS["tip"]), gray(p["film"] / 0.8), p["trajectory"],
+            p["picked"],
             gray(p["time"] / max(p["time"].max(), 1e-6)),
             gray(p["new_height"] / 0.8), p["new_color"], np.asarray(lit) / 255.0,
         ]))  # fmt: skip

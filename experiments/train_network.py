@@ -18,7 +18,7 @@ HELD = 5
 from; the test split is seen once, at the end."""
 
 
-INPUTS = ("hand", "time", "load", "tip", "height", "mixes")
+INPUTS = ("hand", "time", "load", "tip", "film", "height", "mixes")
 """Options that say what a network is given."""
 
 
@@ -39,6 +39,8 @@ class Config(training.Options):
     """Height: with the load of the brush."""
     tip: bool = True
     """Height: with the height of the bristles' tips."""
+    film: bool = True
+    """Height: with the film that the stroke would leave if paint did not flow."""
     height: bool = True
     """Color: with the new height (paper Figure 5)."""
     laid: Path | None = None
@@ -77,7 +79,8 @@ class Stored:
 def batch_of(raw: dict, kind: str, options: Config):
     """Inputs, target and mask of a network, as the options ask for."""
     if kind == "height":
-        return batches.height_batch(raw, options.hand, options.time, options.load, options.tip)
+        told = (options.hand, options.time, options.load, options.tip, options.film)
+        return batches.height_batch(raw, *told)
     return batches.color_batch(raw, options.time, options.height, options.mixes)
 
 

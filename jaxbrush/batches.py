@@ -13,9 +13,11 @@ from jaxbrush.canvas import absorbed, from_srgb, reflected, to_srgb
 from jaxbrush.pairs import COAT
 from jaxbrush.train import Batch
 
-LEVELS = {"height": 1.25, "pressure": 6.0, "sweeps": 64.0, "time": 64.0, "tip": COAT}
+LEVELS = {
+    "height": 1.25, "pressure": 6.0, "sweeps": 64.0, "time": 64.0, "tip": COAT, "film": 1.25,
+}  # fmt: skip
 """Values that uint16's 65535 stands for: height [mm], pressure [maps' unit], sweeps, way of the
-brush [mm], height of a tip [mm]; others 1."""
+brush [mm], heights of a tip and of a film [mm]; others 1."""
 
 
 def _network(x):
@@ -66,18 +68,19 @@ HANDS = ("pressure", "sweeps", "both")
 
 
 def height_batch(
-    pairs: dict, hand: str = "both", time: bool = True, load: bool = True, tip: bool = True
+    pairs: dict, hand: str = "both", time: bool = True, load: bool = True, tip: bool = True,
+    film: bool = True,
 ) -> Batch:  # fmt: skip
     """Inputs and target of the height network: background height, the hand, the way that the brush
-    had gone, its load, how high its hair was -> new height.
+    had gone, its load, how high its hair was, the film that it would leave -> new height.
 
     Args:
       hand: what tells of the hand, one of HANDS: the pressure map as in the paper, the sweep count
         (its Figure 3), or both. The pressure of the latest bristle says little of where hair is
         dense, and grooves are: on bare canvas their correlation with it is -0.01, with the
         logarithm of the count 0.26.
-      time, load, tip: whether these are given: a brush lays less as it empties, and thicker films
-        where its hair is higher.
+      time, load, tip, film: whether these are given: a brush lays less as it empties, and thicker
+        films where its hair is higher; grooves of single bristles are in the film alone.
 
     Raises:
       ValueError: another hand.
@@ -96,6 +99,8 @@ def height_batch(
     if tip:
         high = jnp.asarray(pairs["tip"]) / LEVELS["tip"]
         parts.append(_network(jnp.where(touched(pairs), high, 1.0)))
+    if film:
+        parts.append(network_height(jnp.minimum(pairs["film"], LEVELS["film"])))
     return Batch(
         inputs=jnp.concatenate(parts, axis=-1),
         target=network_height(jnp.asarray(pairs["new_height"])),

@@ -21,12 +21,12 @@ from jaxbrush.paint import PaintConfig
 from jaxbrush.pairs import PairConfig, Picture, canvas_pairs, canvases_pairs
 from jaxbrush.structs import config
 
-FORMAT = 5
+FORMAT = 6
 FULL = 65535
 CHANNELS = (
     ("height", 1), ("color", 3), ("pressure", 1), ("sweeps", 1), ("trajectory", 3), ("time", 1),
-    ("load", 1), ("tip", 1), ("picked", 3), ("lift", 1), ("new_height", 1), ("new_color", 3),
-    ("mask", 1),
+    ("load", 1), ("tip", 1), ("film", 1), ("picked", 3), ("lift", 1), ("new_height", 1),
+    ("new_color", 3), ("mask", 1),
 )  # fmt: skip
 SPLITS = ("train", "test")
 TESTS = 1_000_000

@@ -13,6 +13,7 @@ import numpy as np
 
 from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, make_brush, rollout
 from jaxbrush.canvas import Canvas, flatten, from_srgb, to_srgb
+from jaxbrush.film import laid_film
 from jaxbrush.paint import (
     BrushPaint,
     PaintConfig,
@@ -96,9 +97,9 @@ class Picture:
     height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
     time, load: (h, w) and trajectory: (h, w, 3) maps of the stroke; sweeps and load of a `Loaded`
     track, time by the clock of `on_way` [mm]. tip: (h, w) height of the latest bristle's tip [mm],
-    up to `COAT`. picked: (h, w, 3), lift: (h, w) what bristles had picked up (`picked_up`). mask:
-    (h, w) 1 where it may have changed something. reached: () whether the brush stayed inside the
-    simulated window.
+    up to `COAT`. film: (h, w) height after, if paint did not flow (`laid_film`) [mm]. picked:
+    (h, w, 3), lift: (h, w) what bristles had picked up (`picked_up`). mask: (h, w) 1 where it may
+    have changed something. reached: () whether the brush stayed inside the simulated window.
     """
 
     height: jax.Array
@@ -109,6 +110,7 @@ class Picture:
     time: jax.Array
     load: jax.Array
     tip: jax.Array
+    film: jax.Array
     picked: jax.Array
     lift: jax.Array
     new_height: jax.Array
@@ -208,7 +210,8 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
 
     Returns:
       (dict of pressure, sweeps by hairs in place of bristles, time by the track's clock, load where
-      the brush came, tip, lift (h, w), trajectory and picked (h, w, 3) in sRGB; TrajectoryMaps).
+      the brush came, tip, film, lift (h, w), trajectory and picked (h, w, 3) in sRGB;
+      TrajectoryMaps).
     """
     picked, lift = picked_up(track, canvas, grid.pixel, COAT)
     tip = jnp.clip(track.position[:, -1, 2], 0.0, COAT)
@@ -224,6 +227,7 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
         "picked": maps.color[..., :3],
         "lift": maps.color[..., 3],
         "tip": maps.color[..., 4],
+        "film": laid_film(grid, track, track.hairs[0], track.load[0], canvas.height),
     }, maps
 
 

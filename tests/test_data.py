@@ -116,7 +116,7 @@ def check_colors(p, inputs):
 def test_batches_are_in_network_scale(folder):
     p = data.load(folder).take("test", [0, 1])
     height = batches.height_batch(p)
-    assert height.inputs.shape == (2, 48, 48, 6) and height.target.shape == (2, 48, 48, 1)
+    assert height.inputs.shape == (2, 48, 48, 7) and height.target.shape == (2, 48, 48, 1)
     color = batches.color_batch(p)
     assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
     assert batches.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
@@ -124,10 +124,14 @@ def test_batches_are_in_network_scale(folder):
     np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
     np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
     np.testing.assert_array_equal(height.inputs[..., 3:4], batches.network_time(p["time"]))
-    assert batches.height_batch(p, time=False, load=False, tip=False).inputs.shape[-1] == 3
+    few = batches.height_batch(p, time=False, load=False, tip=False, film=False)
+    assert few.inputs.shape[-1] == 3
     # Above all hair where none came.
-    high = np.asarray(height.inputs[..., 5:])
+    high = np.asarray(height.inputs[..., 5:6])
     assert np.all(high[~np.asarray(batches.touched(p))] == 1.0) and high.min() < -0.5
+    # The film is the canvas where no hair came, and more or less where some did.
+    grown = np.asarray(height.inputs[..., 6:] - height.inputs[..., :1])
+    assert np.all(grown[p["mask"] == 0.0] == 0.0) and grown.max() > 0.2
     mixed = batches.color_batch(p, mixes=True)
     assert mixed.inputs.shape[-1] == 15
     check_colors(p, np.asarray(mixed.inputs))
@@ -216,7 +220,7 @@ def test_long_strokes_fit_their_stamps():
 
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
-    for kind, outputs, channels in (("height", 1, 6), ("color", 3, 15)):
+    for kind, outputs, channels in (("height", 1, 7), ("color", 3, 15)):
         options = GeneratorConfig(outputs, width=0.05, mixes=kind == "color")
         variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
@@ -238,7 +242,7 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     options = GeneratorConfig(1, width=0.05)
     other = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, 3)))
     checkpoint.export(tmp_path / "other.npz", options, other, {})
-    with pytest.raises(SystemExit, match="other.npz: a network of 3 inputs: expected 6"):
+    with pytest.raises(SystemExit, match="other.npz: a network of 3 inputs: expected 7"):
         evaluate.main(evaluate.Config((tmp_path / "other.npz",), data=folder, out=tmp_path))
     (tmp_path / "broken.npz").write_bytes(b"weights")
     with pytest.raises(SystemExit, match="broken.npz"):
@@ -289,7 +293,7 @@ def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
 def test_predicted_heights_are_laid_as_in_use(folder):
     found = data.load(folder)
     config = GeneratorConfig(outputs=1, width=0.05)
-    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 6)))
+    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 7)))
     network = checkpoint.Exported(variables, config, {})
     index = np.arange(found.count("train"))
     heights = train_network.predicted_heights(found, "train", index, network)

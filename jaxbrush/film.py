@@ -1,0 +1,100 @@
+"""The film that a stroke would leave if paint went from hair to canvas and stayed there.
+
+Every column of paint is on its own: hair that passes through draws its film towards the thickness
+at which hair and film are in equilibrium, as the simulator's transfer does
+(`jaxbrush.paint.transfer`), and nothing flows. That is no picture of the stroke, but it has the
+grooves of single bristles, where the maps of the bristle that came last have none: in 67 strokes
+their correlation with the simulator's is 0.5 at wavelengths of 6 to 15 pixels, that of the sweep
+count 0.0.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxbrush.brush import BristleTrack
+from jaxbrush.paint.state import TUNED_HAIRS, make_params
+from jaxbrush.raster import Grid
+
+SAMPLES = 4
+"""Points on the lowest part of a bristle: at its tip alone there is hardly a groove."""
+
+
+def _under(grid: Grid, height, corner):
+    """Height (h, w) of a canvas on the pixels of a grid, 0 off the canvas."""
+    index = [corner[k] + jnp.arange(grid.shape[k], dtype=jnp.int32) for k in (0, 1)]
+    inside = [(i >= 0) & (i < n) for i, n in zip(index, height.shape, strict=True)]
+    row, column = (jnp.clip(i, 0, n - 1) for i, n in zip(index, height.shape, strict=True))
+    there = inside[0][:, None] & inside[1][None]
+    return jnp.where(there, height[row][:, column], 0.0)
+
+
+def laid_film(grid: Grid, track: BristleTrack, hairs, load, height):
+    """Height of the paint after a stroke that only lays and lifts it, on the pixels of a grid.
+
+    Differentiable in places and heights of the hair and in the canvas. A pixel depends on the hair
+    over it alone, so that parts of a stroke are as the whole, to the bit.
+
+    Args:
+      grid: its origin on whole pixels of the canvas. track: of t stamps about a pixel apart, at
+        least 2 nodes and b bristles. hairs: () of the simulator's constants that a bristle stands
+        for. load: () share of what the brush holds. height: (y, x) of the canvas before [mm].
+
+    Returns:
+      (h, w) [mm].
+    """
+    p, pixel = make_params(), grid.pixel
+    radius = p.hair_radius * jnp.sqrt(hairs)
+    coat = p.hair_radius * (p.coat_dry + p.coat_full * load)
+    reach = radius + coat
+    h, w = grid.shape
+    corner = jnp.round(grid.origin[::-1] / pixel).astype(jnp.int32)
+    film = jnp.append(_under(grid, height, corner).reshape(-1), 0.0)  # the last: off the grid
+
+    share = jnp.asarray((np.arange(SAMPLES) + 0.5) / SAMPLES, film.dtype)
+    weight = (1.0 - 0.7 * share) * p.contact_area / (TUNED_HAIRS * SAMPLES * pixel**2)
+    node = track.position[:, -2:].astype(film.dtype)
+    up = node[:, 0] - node[:, 1]
+    part = jnp.minimum(p.hair_length / jnp.sqrt(jnp.sum(up * up, axis=1) + 1e-12), 1.0)
+    # (t, 3, s, b): points on each hair, halfway between two stamps
+    points = node[:, 1, :, None] + share[None, None, :, None] * (up * part[:, None])[:, :, None]
+    points = 0.5 * (points + jnp.concatenate([points[:1], points[:-1]]))
+    moved = jnp.diff(node[:, 1], axis=0, prepend=node[:1, 1])
+    way = jnp.sqrt(jnp.sum(moved * moved, axis=1) + 1e-12)
+    # What of the hair's way counts in a cell that all of it lies in [mm].
+    each = hairs * weight[None, :, None] * way[:, None]
+    place = points[:, :2] / pixel - 0.5
+    low = jnp.floor(place)
+    place, high = place - low, jnp.maximum(points[:, 2], 0.0)
+    first = low[:, ::-1].astype(jnp.int32) - corner[None, :, None, None]
+    size = jnp.asarray([h, w], jnp.int32)[None, :, None, None]
+    near = jnp.any(jnp.all((first >= -1) & (first < size), axis=1), axis=(1, 2))
+    near = near & track.valid & jnp.any(high < reach + jnp.max(film), axis=(1, 2))
+
+    def pass_over(film, first, place, high, each):
+        cells, shares = [], []
+        for dy in (0, 1):
+            for dx in (0, 1):
+                y, x = first[0] + dy, first[1] + dx
+                inside = (y >= 0) & (y < h) & (x >= 0) & (x < w)
+                cells.append(jnp.where(inside, y * w + x, h * w))
+                along = place[0] if dx else 1.0 - place[0]
+                across = place[1] if dy else 1.0 - place[1]
+                shares.append(along * across * each)
+        cell = jnp.stack(cells)
+        under = film[cell]
+        touch = jnp.clip((reach - (high[None] - under)) / reach, 0.0, 1.0)
+        there = jnp.stack(shares) * touch
+        even = jnp.maximum(high + 0.7 * coat - radius, 0.0)[None]
+        none = jnp.zeros_like(film)
+        hair, drawn = none.at[cell].add(there)[cell], none.at[cell].add(there * even)[cell]
+        some = jnp.where(hair > 0.0, hair, 1.0)
+        change = (1.0 - jnp.exp(-p.deposit * hair)) * (drawn / some - under)
+        return film.at[cell].add(there / some * change)
+
+    def step(film, inputs):
+        near, *rest = inputs
+        return jax.lax.cond(near, pass_over, lambda film, *_: film, film, *rest), None
+
+    film, _ = jax.lax.scan(step, film, (near, first, place, high, each))
+    return film[:-1].reshape(h, w)

@@ -1,0 +1,130 @@
+"""The film that a stroke would leave if paint did not flow, against closed forms."""
+
+import dataclasses
+import functools
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from jaxbrush.brush import BristleTrack
+from jaxbrush.film import laid_film
+from jaxbrush.paint.state import make_params
+from jaxbrush.raster import make_grid
+
+PIXEL, LOAD = 0.125, 0.8
+P = make_params()
+COAT = float(P.hair_radius * (P.coat_dry + P.coat_full * LOAD))
+EVEN = 0.7 * COAT - float(P.hair_radius)
+"""Film under hair that lies on the canvas [mm]."""
+
+
+def pulled(y, high=0.0, step=0.1, length=6.0, start=1.0):
+    """Hair that lies along x and is pulled along it, stamps `step` apart [mm]."""
+    way = np.arange(0.0, length + 1e-9, step)
+    y = np.broadcast_to(np.asarray(y, float), (len(np.atleast_1d(y)),))
+    tip = np.empty((len(way), 3, len(y)))
+    tip[:, 0] = start + way[:, None]
+    tip[:, 1], tip[:, 2] = y[None], high
+    position = np.stack([tip + np.array([[1.0], [0.0], [0.0]]), tip], axis=1)
+    return BristleTrack(
+        time=jnp.asarray(way, jnp.float32), position=jnp.asarray(position, jnp.float32),
+        force=jnp.zeros((len(way), 2, len(y))), reaction=jnp.zeros((len(way), 3)),
+        valid=jnp.ones(len(way), bool),
+    )  # fmt: skip
+
+
+@functools.partial(jax.jit, static_argnames="shape")
+def film(track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0)):
+    return laid_film(make_grid(shape, origin, PIXEL), track, hairs, load, height)
+
+
+BARE = jnp.zeros((32, 80))
+
+
+def test_many_hairs_leave_their_equilibrium_and_thicker_paint_is_drawn_down_to_it():
+    track = pulled(np.full(60, 2.0 + 0.5 * PIXEL))  # over the middle of row 16
+    for before in (0.0, 0.5 * EVEN, EVEN + 0.05):
+        after = np.asarray(film(track, BARE + before))[16, 24:48]
+        np.testing.assert_allclose(after, EVEN, rtol=1e-3)
+        np.testing.assert_array_equal(film(track, BARE + before)[20], (BARE + before)[20])
+
+
+def test_one_pass_of_one_hair_follows_the_rate():
+    # At rest over a pixel but for one step: all of the film's change is one exponential.
+    y, x = 16, 40
+    track = pulled([(y + 0.5) * PIXEL], length=0.02, step=0.02, start=(x + 0.5) * PIXEL - 0.46)
+    grown = np.asarray(film(track, BARE))
+    share = float(P.contact_area) / 260 / PIXEL**2
+    # The hair's length lies over 0.9 mm of the row, its mean weight 0.65.
+    ways = -np.log1p(-grown[y] / EVEN) / float(P.deposit)
+    assert ways.sum() == pytest.approx(0.65 * share * 0.02, rel=0.03)
+    assert np.abs(np.delete(grown, y, 0)).max() == 0.0
+
+
+def test_hair_in_the_air_and_none_leaves_the_canvas_bit_identical():
+    height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.1)
+    for track in (
+        pulled([2.0], high=1.0),
+        dataclasses.replace(pulled([2.0]), valid=jnp.zeros(61, bool)),
+    ):
+        np.testing.assert_array_equal(film(track, height), height)
+
+
+def test_hair_that_rides_higher_leaves_more():
+    low, high = (film(pulled(np.full(60, 2.06), high=z), BARE)[16, 40] for z in (0.0, 0.08))
+    assert float(high) > 1.2 * float(low)
+
+
+def test_grooves_follow_single_hairs():
+    # Two rows of hair, six pixels apart.
+    after = np.asarray(film(pulled([1.56] * 9 + [2.31] * 9), BARE))[:, 40]
+    assert after[12] > 0.9 * EVEN and after[18] > 0.9 * EVEN and after[15] == 0.0
+
+
+def test_stamps_twice_as_close_change_little():
+    height = 0.1 * jnp.ones((32, 80))
+    y = np.random.default_rng(0).uniform(1.5, 2.5, 24)
+    coarse, fine = (np.asarray(film(pulled(y, step=s), height)) for s in (0.1, 0.05))
+    change = np.abs(fine - height).max()
+    assert np.sqrt(np.mean((fine - coarse) ** 2)) < 0.03 * change
+
+
+def test_a_part_of_the_canvas_is_as_the_whole_to_the_bit():
+    height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.2)
+    track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
+    whole = np.asarray(film(track, height))
+    origin = jnp.asarray([24 * PIXEL, 8 * PIXEL])
+    part = np.asarray(film(track, height, shape=(16, 32), origin=origin))
+    np.testing.assert_array_equal(part, whole[8:24, 24:56])
+    # Off the canvas lies no paint before, and its edges are no mirrors.
+    origin = jnp.asarray([-8 * PIXEL, -8 * PIXEL])
+    around = np.asarray(film(track, height, shape=(48, 96), origin=origin))
+    np.testing.assert_array_equal(around[8:40, 8:88], whole)
+
+
+def test_slopes_are_those_of_differences_and_finite():
+    height = 0.05 * jnp.ones((32, 80))
+    track = pulled(np.random.default_rng(0).uniform(1.6, 2.4, 12), length=2.0)
+
+    def total(shift, raised):
+        position = track.position + jnp.stack([0.0 * shift, shift, raised])[None, None, :, None]
+        found = film(dataclasses.replace(track, position=position), height)
+        return jnp.sum(found * jnp.linspace(0.0, 1.0, 32)[:, None])
+
+    with jax.enable_x64(False):
+        slopes = jax.grad(total, (0, 1))(0.013, 0.02)
+        e = 2e-3
+        by_shift = (total(0.013 + e, 0.02) - total(0.013 - e, 0.02)) / (2 * e)
+        by_height = (total(0.013, 0.02 + e) - total(0.013, 0.02 - e)) / (2 * e)
+    np.testing.assert_allclose(slopes, (by_shift, by_height), rtol=0.03)
+    none = jax.grad(lambda h: film(pulled([2.0], high=0.0), h).sum())(BARE)
+    assert np.all(np.isfinite(none))
+
+
+def test_in_a_batch_it_is_the_same():
+    tracks = [pulled([2.0, 2.3]), pulled([1.7, 2.9], high=0.05)]
+    many = jax.vmap(lambda t: film(t, BARE))(jax.tree.map(lambda *x: jnp.stack(x), *tracks))
+    for found, track in zip(many, tracks, strict=True):
+        np.testing.assert_allclose(found, film(track, BARE), atol=1e-6)
