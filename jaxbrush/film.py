@@ -42,7 +42,12 @@ def laid_film(grid: Grid, track: BristleTrack, hairs, load, height):
 
     Returns:
       (h, w) [mm].
+
+    Raises:
+      ValueError: a track of the tips alone.
     """
+    if track.position.shape[1] < 2:
+        raise ValueError(f"track of {track.position.shape[1]} node: expected at least 2")
     p, pixel = make_params(), grid.pixel
     radius = p.hair_radius * jnp.sqrt(hairs)
     coat = p.hair_radius * (p.coat_dry + p.coat_full * load)

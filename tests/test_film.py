@@ -123,6 +123,12 @@ def test_slopes_are_those_of_differences_and_finite():
     assert np.all(np.isfinite(none))
 
 
+def test_tips_alone_are_refused():
+    track = pulled([2.0])
+    with pytest.raises(ValueError, match="1 node: expected at least 2"):
+        film(dataclasses.replace(track, position=track.position[:, 1:]), BARE)
+
+
 def test_in_a_batch_it_is_the_same():
     tracks = [pulled([2.0, 2.3]), pulled([1.7, 2.9], high=0.05)]
     many = jax.vmap(lambda t: film(t, BARE))(jax.tree.map(lambda *x: jnp.stack(x), *tracks))

@@ -16,7 +16,7 @@ from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.stylus import make_stroke
 
 OPTIONS = painter.PainterConfig(
-    brush=BrushConfig(nodes=4, track_nodes=1, approach=2),
+    brush=BrushConfig(nodes=4, track_nodes=2, approach=2),
     patches=patches.PatchConfig(size=28, overlap=8), stamps=(32,), cells=(5,), batch=16,
     blend="feather", moments="patch",
 )  # fmt: skip

@@ -16,7 +16,7 @@ from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.session import Session
 
 OPTIONS = painter.PainterConfig(
-    brush=BrushConfig(nodes=4, track_nodes=1, approach=2), stamps=(1024,), sides=(64,)
+    brush=BrushConfig(nodes=4, track_nodes=2, approach=2), stamps=(1024,), sides=(64,)
 )
 SHAPE = (230, 330)
 PAINT = np.asarray((0.1, 0.02, 0.5), np.float32)
@@ -34,7 +34,10 @@ def nets(norm):
         draw = lambda x: jnp.asarray(rng.normal(0.0, 0.15, x.shape), jnp.float32)  # noqa: E731
         return jax.tree.map(draw, shapes), config
 
-    (height, height_config), (color, color_config) = one(6, 1), one(15, 3)
+    (height, height_config), (color, color_config) = (
+        one(painter.HEIGHT_INPUTS, 1),
+        one(painter.MIXED_INPUTS, 3),
+    )
     return painter.Nets(height, color, height_config, color_config)
 
 
