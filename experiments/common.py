@@ -9,6 +9,7 @@ from pathlib import Path
 
 import jax
 import matplotlib
+import matplotlib.transforms
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -92,6 +93,45 @@ def save_figure(figure, path: Path, **options):
     figure.savefig(partial, format=path.suffix[1:], **options)
     matplotlib.pyplot.close(figure)
     os.replace(partial, path)
+
+
+def label_points(axis, labels):
+    """Writes names beside points, each where it covers no other and no point, inside the axes.
+
+    Call it when limits are set and all else is drawn.
+
+    Args:
+      labels: (text, (x, y), dict of text properties) each; the first choose first.
+    """
+    figure = axis.figure
+    figure.draw_without_rendering()  # the layout, which sizes the axes
+    renderer, frame = figure.canvas.get_renderer(), axis.get_window_extent()
+    places = axis.transData.transform([at for _, at, _ in labels])
+    taken = [matplotlib.transforms.Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
+    for text, at, style in labels:
+        best = None
+        for away in (5, 12, 20, 28):
+            for side, up in ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0)):
+                offset = (side * away if up == 0 else 5 * side, up * away)
+                note = axis.annotate(
+                    text, at, offset, textcoords="offset points", va="center",
+                    ha="left" if side > 0 else "right", **style,
+                )  # fmt: skip
+                note.set_in_layout(False)
+                box = note.get_window_extent(renderer)
+                outside = not (frame.contains(box.x0, box.y0) and frame.contains(box.x1, box.y1))
+                cost = 10 * outside + sum(box.overlaps(b) for b in taken)
+                if best is None or cost < best[0]:
+                    if best is not None:
+                        best[1].remove()
+                    best = cost, note, box
+                else:
+                    note.remove()
+                if best[0] == 0:
+                    break
+            if best[0] == 0:
+                break
+        taken.append(best[2])
 
 
 def print_table(title: str, columns: list[str], rows: list[list], marked: int | None = None):

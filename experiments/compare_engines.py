@@ -21,6 +21,7 @@ from experiments.common import (
     COLORS,
     INK,
     console,
+    label_points,
     print_table,
     results_folder,
     save_figure,
@@ -149,20 +150,21 @@ def chart(options, canvases, results, tints, path: Path):
         took = results[name]["milliseconds"]
         axis.set_title(f"{name}: {took:.0f} ms a stroke", loc="left")
         axis.grid(False)
+    named = []
     for k, (measure, label) in enumerate(
         (("color", "color, mean ΔE (CIEDE2000)"), ("height", "height, rms [µm]"))
     ):
-        axis = figure.add_subplot(grid[1, 3 * k : 3 * k + 3])
+        axis, names = figure.add_subplot(grid[1, 3 * k : 3 * k + 3]), []
         for number, (name, row) in enumerate(results.items()):
             if name == "offline":
                 axis.axhline(row["milliseconds"], color=INK, lw=0.8, ls=(0, (4, 3)))
                 continue
             at = row["errors"][max(row["errors"])][measure], row["milliseconds"]
             axis.plot(*at, "o", color=COLORS[number % len(COLORS)])
-            axis.annotate(name.replace("realtime, ", ""), at, (5, 4), fontsize=7,
-                          textcoords="offset points")  # fmt: skip
+            names.append((name.replace("realtime, ", ""), at, {"fontsize": 7}))
         axis.set(yscale="log", xlabel=label, title="Time against error" if not k else "")
         axis.margins(0.25, 0.2)
+        named.append((axis, names))
         if not k:
             axis.set_ylabel("time a stroke [ms]; dashed: offline")
     axis = figure.add_subplot(grid[1, 6:9])
@@ -180,6 +182,8 @@ def chart(options, canvases, results, tints, path: Path):
              title="White over white")  # fmt: skip
     axis.legend(fontsize=8)
     figure.suptitle("The same strokes by simulator and networks", x=0.01, ha="left")
+    for axis, names in named:
+        label_points(axis, names)
     save_figure(figure, path)
 
 

@@ -168,6 +168,7 @@ def chart(points: list[dict], results: dict, options: Config, path: Path):
     grid = figure.add_gridspec(2, 12, height_ratios=(1.6, 1.0))
     panels = [figure.add_subplot(grid[0, 4 * k : 4 * k + 4]) for k in range(3)]
     labels = ("height, rms [µm]", "color, mean ΔE (CIEDE2000)")
+    names = {axis: [] for axis in panels[:2]}
 
     def note(axis, text, at, offset=(6, 4), **style):
         axis.annotate(text, at, offset, textcoords="offset points", **style).set_in_layout(False)
@@ -177,17 +178,18 @@ def chart(points: list[dict], results: dict, options: Config, path: Path):
             mine = [p for p in points if p["family"] == family]
             x, y = [p["error"][k] for p in mine], [p["ms_per_mm"] for p in mine]
             axis.plot(x, y, marker, color=color, label=text, zorder=3)
-            for p, *at in zip(mine, x, y, strict=True):
-                # The solvers lie on top of each other; the table has them.
-                if family != "solver":
-                    note(axis, p["tag"], at, fontsize=7, color=color)
+            # The solvers lie on top of each other; the table has them.
+            if family != "solver":
+                style = {"fontsize": 7, "color": color}
+                names[axis] += [(p["tag"], at, style) for p, *at in zip(mine, x, y, strict=True)]
         for p in points[:2]:
             at = p["error"][k], p["ms_per_mm"]
             axis.plot(*at, "o", ms=13, mew=1.6, mfc="none", mec=INK, zorder=5)
-            note(axis, p["name"], at, (-10, -16), weight="bold", ha="right")
+            names[axis].insert(0, ("  " + p["name"], at, {"weight": "bold"}))
         axis.axhline(BARS["realtime"][1], color=INK, lw=0.8, ls=(0, (4, 3)))
         low, high = (f(p["error"][k] for p in points) for f in (min, max))
-        axis.set(xscale="log", yscale="log", xlabel=label, xlim=(0.65 * low, 1.7 * high))
+        axis.set(xscale="log", yscale="log", xlabel=label, xlim=(0.65 * low, 2.2 * high))
+        axis.margins(y=0.12)
         axis.xaxis.set(major_locator=LogLocator(subs=(1, 2, 5)), major_formatter="{x:g}",
                        minor_formatter=NullFormatter())  # fmt: skip
     panels[0].set(ylabel="time for a millimetre of stroke [ms]", title="Speed against accuracy")
@@ -229,6 +231,8 @@ def chart(points: list[dict], results: dict, options: Config, path: Path):
         f"{machine()}.",
         fontsize=9, x=0.01, ha="left",
     )  # fmt: skip
+    for axis, found in names.items():
+        common.label_points(axis, found)
     common.save_figure(figure, path)
 
 
