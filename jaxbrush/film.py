@@ -94,7 +94,7 @@ def laid_film(grid: Grid, track: BristleTrack, hairs, load, height):
         none = jnp.zeros_like(film)
         hair, drawn = none.at[cell].add(there)[cell], none.at[cell].add(there * even)[cell]
         some = jnp.where(hair > 0.0, hair, 1.0)
-        change = (1.0 - jnp.exp(-p.deposit * hair)) * (drawn / some - under)
+        change = -jnp.expm1(-p.deposit * hair) * (drawn / some - under)
         return film.at[cell].add(there / some * change)
 
     def step(film, inputs):

@@ -23,6 +23,7 @@ def folder(tmp_path_factory):
     return path
 
 
+@pytest.mark.slow
 def test_variants_are_trained_once_and_charted(folder, tmp_path, capsys):
     given = dict(kind="height", data=folder, out=tmp_path, quick=True)
     only = ("width 1/8", "the paper's maps")

@@ -51,6 +51,7 @@ def test_a_pair_depends_on_its_seed_and_number_only(folder):
     assert np.abs(other.new_height - alone.new_height).max() > 0.02
 
 
+@pytest.mark.slow
 def test_canvases_side_by_side_are_the_same_pairs(folder, tmp_path):
     """As a GPU makes them: the same maps and as much paint. Single grooves differ, as they do where
     a stroke is shifted by a nanometre."""

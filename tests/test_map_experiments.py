@@ -27,6 +27,7 @@ def _check(folder, capsys):
     assert "Bar" in capsys.readouterr().out
 
 
+@pytest.mark.slow
 def test_accuracy(tmp_path, capsys, monkeypatch):
     # Without what would be compiled for its time alone, and with a coarser reference.
     draw, roll = map_accuracy.draw, map_accuracy.roll

@@ -40,7 +40,7 @@ def network(inputs, outputs, norm="instance", width=0.05, mixes=False):
     return checkpoint.Exported(jax.tree.map(draw, shape), config, {"made by": "a test"})
 
 
-NETS = painter.make_nets(network(6, 1), network(8, 3))
+NETS = painter.make_nets(network(painter.HEIGHT_INPUTS, 1), network(painter.COLOR_INPUTS, 3))
 
 
 LONG = jax.tree.map(np.asarray, make_stroke(np.zeros((80, 2)), pressure=0.6))
@@ -252,7 +252,7 @@ def test_networks_see_what_they_were_trained_on():
         run = lambda net, x: image_scale(  # noqa: E731
             Generator(net.config).apply(net.variables, x)
         )
-        height = run(network(6, 1), batches.height_batch(pair).inputs)
+        height = run(network(painter.HEIGHT_INPUTS, 1), batches.height_batch(pair).inputs)
         new = batches.LEVELS["height"] * height - pair["height"]
         new = pair["height"] + pair["share"] * new
         color = run(network(8, 3), batches.color_batch(pair | {"new_height": new}).inputs)
@@ -294,8 +294,8 @@ def test_the_pure_function_is_the_driver():
 
     found = check_slope(error, 2.5e-4)
     want = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
-    np.testing.assert_allclose(found.color, want.color, atol=2e-5)
-    np.testing.assert_allclose(found.height, want.height, atol=2e-5)
+    np.testing.assert_allclose(found.color, want.color, atol=4e-5)
+    np.testing.assert_allclose(found.height, want.height, atol=4e-5)
 
 
 @pytest.mark.slow
@@ -396,8 +396,11 @@ def test_the_preview_is_that_of_the_maps():
 
 def test_arguments_are_checked(tmp_path):
     with pytest.raises(ValueError, match="color network has 7 inputs"):
-        painter.make_nets(network(6, 1), network(7, 3))
-    for name, net in (("h", network(6, 1)), ("c", network(8, 3))):
+        painter.make_nets(network(painter.HEIGHT_INPUTS, 1), network(7, 3))
+    for name, net in (
+        ("h", network(painter.HEIGHT_INPUTS, 1)),
+        ("c", network(painter.COLOR_INPUTS, 3)),
+    ):
         checkpoint.export(tmp_path / f"{name}.npz", net.config, net.variables, net.card)
     nets = painter.load_nets(tmp_path / "h.npz", tmp_path / "c.npz")
     assert nets.color_config.outputs == 3

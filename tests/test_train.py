@@ -164,6 +164,7 @@ def test_loss_falls_and_is_reported_finite(training):
     assert 0.0 <= found[-1]["accuracy"] <= 1.0 and found[-1]["gradient_ratio"] > 0.0
 
 
+@pytest.mark.slow
 def test_one_odd_picture_does_not_undo_the_training(monkeypatch):
     """After 400 usual updates: uncut, Adam's step is 8 times as long as usual."""
     usual = [a_batch(k) for k in range(8)]

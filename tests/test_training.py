@@ -148,6 +148,7 @@ def test_no_budget_is_refused(tmp_path):
         training.run(options, "height", toy(2), toy(2), tmp_path)
 
 
+@pytest.mark.slow
 def test_a_training_may_start_from_exported_weights(tmp_path):
     """Of the same network they are taken as they are; moments are folded where norms differ."""
     pairs = toy(8)
