@@ -6,7 +6,7 @@ memory it works in. It needs NVIDIA's plugin for JAX (`pip install --no-deps jax
 jax-cuda12-pjrt`, both of the version of jaxlib), but no GPU, no driver and no CUDA libraries.
 Nothing runs: times and numbers of a GPU are not among what this shows.
 
-    python -m experiments.compile_gpu            # about five minutes
+    python -m experiments.compile_gpu            # about two minutes
     python -m experiments.compile_gpu --quick    # small sizes, about a minute
 """
 
