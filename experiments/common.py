@@ -1,6 +1,7 @@
 """What the experiments share: where results go, how time is taken, how charts and tables look."""
 
 import dataclasses
+import itertools
 import json
 import os
 import sys
@@ -108,27 +109,22 @@ def label_points(axis, labels):
     renderer, frame = figure.canvas.get_renderer(), axis.get_window_extent()
     places = axis.transData.transform([at for _, at, _ in labels])
     taken = [matplotlib.transforms.Bbox.from_bounds(x - 4, y - 4, 8, 8) for x, y in places]
+    sides = ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0))
     for text, at, style in labels:
-        best = None
-        for away in (5, 12, 20, 28):
-            for side, up in ((1, 1), (1, -1), (-1, 1), (-1, -1), (1, 0), (-1, 0)):
-                offset = (side * away if up == 0 else 5 * side, up * away)
-                note = axis.annotate(
-                    text, at, offset, textcoords="offset points", va="center",
-                    ha="left" if side > 0 else "right", **style,
-                )  # fmt: skip
-                note.set_in_layout(False)
-                box = note.get_window_extent(renderer)
-                outside = not (frame.contains(box.x0, box.y0) and frame.contains(box.x1, box.y1))
-                cost = 10 * outside + sum(box.overlaps(b) for b in taken)
-                if best is None or cost < best[0]:
-                    if best is not None:
-                        best[1].remove()
-                    best = cost, note, box
-                else:
-                    note.remove()
-                if best[0] == 0:
-                    break
+        best = np.inf, None, None
+        for away, (side, up) in itertools.product((5, 12, 20, 28), sides):
+            offset = (side * (5 if up else away), up * away)
+            note = axis.annotate(
+                text, at, offset, textcoords="offset points", va="center",
+                ha="left" if side > 0 else "right", **style,
+            )  # fmt: skip
+            note.set_in_layout(False)
+            box = note.get_window_extent(renderer)
+            outside = not (frame.contains(box.x0, box.y0) and frame.contains(box.x1, box.y1))
+            cost = 10 * outside + sum(box.overlaps(b) for b in taken)
+            worse, best = (note, best) if cost >= best[0] else (best[1], (cost, note, box))
+            if worse is not None:
+                worse.remove()
             if best[0] == 0:
                 break
         taken.append(best[2])

@@ -1,5 +1,5 @@
-"""What would a GPU have to hold? Every stage at full size, compiled for a GPU that need not be
-there.
+"""What would a GPU have to hold? Simulator, data and training at full size, compiled for a GPU
+that need not be there.
 
 XLA's own compiler for NVIDIA GPUs turns each stage into a program for one H200 and says how much
 memory it works in. It needs NVIDIA's plugin for JAX (`pip install --no-deps jax-cuda12-plugin

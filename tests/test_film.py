@@ -23,7 +23,7 @@ EVEN = 0.7 * COAT - float(P.hair_radius)
 def pulled(y, high=0.0, step=0.1, length=6.0, start=1.0):
     """Hair that lies along x and is pulled along it, stamps `step` apart [mm]."""
     way = np.arange(0.0, length + 1e-9, step)
-    y = np.broadcast_to(np.asarray(y, float), (len(np.atleast_1d(y)),))
+    y = np.asarray(y, float)
     tip = np.empty((len(way), 3, len(y)))
     tip[:, 0] = start + way[:, None]
     tip[:, 1], tip[:, 2] = y[None], high
@@ -98,10 +98,11 @@ def test_a_part_of_the_canvas_is_as_the_whole_to_the_bit():
     origin = jnp.asarray([24 * PIXEL, 8 * PIXEL])
     part = np.asarray(film(track, height, shape=(16, 32), origin=origin))
     np.testing.assert_array_equal(part, whole[8:24, 24:56])
-    # Off the canvas lies no paint before, and its edges are no mirrors.
+    # Off its edges the canvas goes on, as the networks see it.
     origin = jnp.asarray([-8 * PIXEL, -8 * PIXEL])
     around = np.asarray(film(track, height, shape=(48, 96), origin=origin))
     np.testing.assert_array_equal(around[8:40, 8:88], whole)
+    np.testing.assert_array_equal(around[:4, 8:88], np.broadcast_to(height[0], (4, 80)))
 
 
 def test_slopes_are_those_of_differences_and_finite():
