@@ -196,14 +196,10 @@ class Simulator:
 
 
 def fewer(deed: Deed, count: int) -> tuple[BrushParams, PaintParams, int]:
-    """The brush of a deed with every n-th bristle only, thicker by as much."""
+    """The brush of a deed with every n-th bristle only, which stand for as many more hairs."""
     keep = np.linspace(0, deed.bristles - 1, count).round().astype(int)
     take = lambda x: x[..., keep] if x.ndim and x.shape[-1] == deed.bristles else x  # noqa: E731
-    thicker = float(np.sqrt(deed.bristles / count))
-    paint = dataclasses.replace(
-        deed.paint, hair_radius=deed.paint.hair_radius * thicker,
-        coat_dry=deed.paint.coat_dry / thicker, coat_full=deed.paint.coat_full / thicker,
-    )  # fmt: skip
+    paint = dataclasses.replace(deed.paint, hairs=deed.paint.hairs * deed.bristles / count)
     return jax.tree.map(take, deed.brush), paint, count
 
 

@@ -103,6 +103,41 @@ def errors(name, found, size):
     return error
 
 
+def thicker(params, times):
+    """The naive way to let a bristle stand for `times` hairs: one hair of their cross-section,
+    under a coat as thick as before."""
+    root = np.sqrt(times)
+    return dataclasses.replace(
+        params,
+        hair_radius=params.hair_radius * root,
+        coat_dry=params.coat_dry / root,
+        coat_full=params.coat_full / root,
+    )
+
+
+def test_fewer_bristles_lay_as_much():
+    moves = track()
+
+    def laid(params, every, first):
+        some = dataclasses.replace(
+            moves, **{n: getattr(moves, n)[..., first::every] for n in ("position", "force")}
+        )
+        brush = load_brush(CONFIG, params, BRISTLES // every, 0.8, jnp.asarray([1.0, 0.0]))
+        canvas, *_ = stroke(CONFIG, params, empty_canvas(CONFIG, (SIDE, SIDE)), brush, some)
+        return float(jnp.sum(height(CONFIG, canvas)))
+
+    full = laid(params_of(), 1, 0)
+    more, thick = {}, {}
+    for n in (2, 4):
+        # Every share of the bristles, for one alone rides higher or lower than the brush.
+        mean = lambda params, n=n: np.mean([laid(params, n, k) for k in range(n)]) / full - 1.0  # noqa: E731
+        more[n], thick[n] = mean(params_of(hairs=n)), mean(thicker(params_of(), n))
+    print("laid with a half and a quarter of the bristles:", more, "as thicker hairs:", thick)
+    # Ten bristles, a third of a millimetre apart, leave rows of columns that none passes over.
+    assert abs(more[2]) < 0.07 and abs(more[4]) < 0.13
+    assert thick[2] < 1.5 * more[2] and thick[4] < 1.5 * more[4]
+
+
 @pytest.mark.slow
 def test_a_stroke_converges_as_stamps_get_closer():
     found = [next(films({}, step=0.24 / 2**n)) for n in range(6)]

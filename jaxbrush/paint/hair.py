@@ -69,7 +69,7 @@ def hair(config: PaintConfig, params: PaintParams, before, now, dt, count_share)
     part = jnp.asarray(np.repeat(part / each, each), now.dtype)[:, None]
     # The hair tapers to half its cross-section at the tip.
     taper = jnp.tile(0.5 + 0.5 * share, config.sweeps * offset.shape[1])
-    volume = jnp.pi * params.hair_radius**2 * params.hair_length
+    volume = params.hairs * jnp.pi * params.hair_radius**2 * params.hair_length
     mean = jnp.mean(now[1] - before[1], axis=1)
     return Hair(
         place=place,

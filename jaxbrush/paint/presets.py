@@ -11,8 +11,7 @@ REAL = 260
 
 
 def params_of(bristles: int = REAL) -> PaintParams:
-    """The default constants, for a brush of so many bristles: fewer are thicker, so that they fill
-    the same share of the paint, under a coat of the same thickness."""
+    """The default constants, for a brush of so many bristles: fewer stand for more hairs each."""
     return for_brush(make_params(), 4.5, 1.4, bristles)
 
 

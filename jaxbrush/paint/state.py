@@ -73,9 +73,10 @@ class PaintParams:
     count and stamp interval may change.
     """
 
-    hair_radius: jax.Array  # of a bristle in the paint [mm]
+    hair_radius: jax.Array  # of a real hair in the paint [mm]
+    hairs: jax.Array  # real hairs that a simulated bristle stands for
     hair_length: jax.Array  # lowest part of a bristle that meets paint [mm]
-    coat_dry: jax.Array  # coat of paint on a dry bristle, times hair_radius
+    coat_dry: jax.Array  # coat of paint on a dry hair, times hair_radius
     coat_full: jax.Array  # what a full tip adds to that, times hair_radius
     compliance: jax.Array  # share of the way to the paint's surface a bristle rides up
     tip_volume: jax.Array  # capacity of all tips together [mm^3]
@@ -105,7 +106,7 @@ def make_params(**changes) -> PaintParams:
       ValueError: a name that is not a constant.
     """
     values = {
-        "hair_radius": 0.03, "hair_length": 0.9, "coat_dry": 0.33, "coat_full": 8.0,
+        "hair_radius": 0.03, "hairs": 1.0, "hair_length": 0.9, "coat_dry": 0.33, "coat_full": 8.0,
         "compliance": 0.4, "tip_volume": 7.5, "reservoir_volume": 63.0, "contact_area": 20.0,
         "deposit": 12.8, "squeeze": 0.4, "cling": 4.0, "pickup": 4.0, "exchange": 0.48,
         "exchange_depth": 0.125, "refill": 0.8, "soak": 10.0, "drag": 256.0, "lid": 0.9,
@@ -122,23 +123,23 @@ TUNED_AREA, TUNED_HAIRS = 4.5 * 1.4, 260
 """Ferrule [mm^2] and hair count of the brush that the default constants belong to."""
 
 
-def for_brush(params: PaintParams, width, thickness, hairs: int, disc: bool = False) -> PaintParams:
-    """The constants for a brush of another size or hair count: it holds paint by the area of its
-    ferrule, and fewer hairs are thicker under the same coat.
+def for_brush(
+    params: PaintParams, width, thickness, bristles: int, disc: bool = False
+) -> PaintParams:
+    """The constants for a brush of another size or bristle count: it holds paint by the area of its
+    ferrule, and fewer bristles stand for more hairs each. They have the volume of all these hairs,
+    but the film they are in equilibrium with is that of a single one.
 
     Args:
-      width, thickness: of the ferrule [mm]. hairs: simulated bristles. disc: round ferrule.
+      width, thickness: of the ferrule [mm]. bristles: simulated. disc: round ferrule.
     """
     share = width * thickness / TUNED_AREA * (0.25 * np.pi if disc else 1.0)
-    thicker = jnp.sqrt(share * TUNED_HAIRS / hairs)
     return dataclasses.replace(
         params,
         tip_volume=params.tip_volume * share,
         reservoir_volume=params.reservoir_volume * share,
         contact_area=params.contact_area * share,
-        hair_radius=params.hair_radius * thicker,
-        coat_dry=params.coat_dry / thicker,
-        coat_full=params.coat_full / thicker,
+        hairs=params.hairs * share * TUNED_HAIRS / bristles,
     )
 
 
