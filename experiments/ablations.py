@@ -47,10 +47,12 @@ VARIANTS = {
         "no load": {"load": False},
         "no height of the tips": {"tip": False},
         "no film": {"film": False},
+        "no hair in the film": {"hair": False},
         "no sweep count": {"hand": "pressure"},
         "no pressure": {"hand": "sweeps"},
         "the paper's maps": {
             "hand": "pressure", "time": False, "load": False, "tip": False, "film": False,
+            "hair": False,
         },
     },
     "color": _BOTH | {

@@ -35,7 +35,7 @@ class Config:
     """A data set of training pairs; goes on where an earlier run stopped."""
 
     preset: Literal["tiny", "cpu", "small", "paper"] = "tiny"
-    """160 + 40 or 800 + 112 pairs of 128 x 128, 1,000 + 125 of 256 x 256, or 10,000 + 1,000 of
+    """160 + 40 or 2,000 + 112 pairs of 128 x 128, 1,000 + 125 of 256 x 256, or 10,000 + 1,000 of
     512 x 512."""
     out: Path | None = None
     """Folder of the set [default: results/data_<preset>]."""
@@ -166,8 +166,8 @@ def sheet(found: data.Dataset, path: Path) -> None:
         lit = picture(shade(after, pixel))
         rows.append(np.hstack([
             gray(p["height"] / 0.8), p["color"], gray(np.sqrt(p["pressure"] / 4.0)),
-            gray(p["tip"] / batches.LEVELS["tip"]), gray(p["film"] / 0.8), p["trajectory"],
-            p["picked"],
+            gray(p["tip"] / batches.LEVELS["tip"]), gray(p["film"] / 0.8),
+            gray(np.sqrt(p["hair"] / batches.LEVELS["hair"])), p["trajectory"], p["picked"],
             gray(p["time"] / max(p["time"].max(), 1e-6)),
             gray(p["new_height"] / 0.8), p["new_color"], np.asarray(lit) / 255.0,
         ]))  # fmt: skip

@@ -18,7 +18,7 @@ HELD = 5
 from; the test split is seen once, at the end."""
 
 
-INPUTS = ("hand", "time", "load", "tip", "film", "height", "mixes")
+INPUTS = ("hand", "time", "load", "tip", "film", "hair", "height", "mixes")
 """Options that say what a network is given."""
 
 
@@ -41,6 +41,8 @@ class Config(training.Options):
     """Height: with the height of the bristles' tips."""
     film: bool = True
     """Height: with the film that the stroke would leave if paint did not flow."""
+    hair: bool = True
+    """Height: with the hair that was in that film last."""
     height: bool = True
     """Color: with the new height (paper Figure 5)."""
     laid: Path | None = None
@@ -79,7 +81,7 @@ class Stored:
 def batch_of(raw: dict, kind: str, options: Config):
     """Inputs, target and mask of a network, as the options ask for."""
     if kind == "height":
-        told = (options.hand, options.time, options.load, options.tip, options.film)
+        told = (options.hand, options.time, options.load, options.tip, options.film, options.hair)
         return batches.height_batch(raw, *told)
     return batches.color_batch(raw, options.time, options.height, options.mixes)
 

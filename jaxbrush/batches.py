@@ -15,9 +15,10 @@ from jaxbrush.train import Batch
 
 LEVELS = {
     "height": 1.25, "pressure": 6.0, "sweeps": 64.0, "time": 64.0, "tip": COAT, "film": 1.25,
+    "hair": 0.05,
 }  # fmt: skip
 """Values that uint16's 65535 stands for: height [mm], pressure [maps' unit], sweeps, way of the
-brush [mm], heights of a tip and of a film [mm]; others 1."""
+brush [mm], heights of a tip and of a film, thickness of hair [mm]; others 1."""
 
 
 def _network(x):
@@ -69,18 +70,20 @@ HANDS = ("pressure", "sweeps", "both")
 
 def height_batch(
     pairs: dict, hand: str = "both", time: bool = True, load: bool = True, tip: bool = True,
-    film: bool = True,
+    film: bool = True, hair: bool = True,
 ) -> Batch:  # fmt: skip
     """Inputs and target of the height network: background height, the hand, the way that the brush
-    had gone, its load, how high its hair was, the film that it would leave -> new height.
+    had gone, its load, how high its hair was, the film that it would leave and the hair in that
+    film -> new height.
 
     Args:
       hand: what tells of the hand, one of HANDS: the pressure map as in the paper, the sweep count
         (its Figure 3), or both. The pressure of the latest bristle says little of where hair is
         dense, and grooves are: on bare canvas their correlation with it is -0.01, with the
         logarithm of the count 0.26.
-      time, load, tip, film: whether these are given: a brush lays less as it empties, and thicker
-        films where its hair is higher; grooves of single bristles are in the film alone.
+      time, load, tip, film, hair: whether these are given: a brush lays less as it empties, and
+        thicker films where its hair is higher; grooves of single bristles are in the film, and
+        ridges where there is little hair in it.
 
     Raises:
       ValueError: another hand.
@@ -101,6 +104,9 @@ def height_batch(
         parts.append(_network(jnp.where(touched(pairs), high, 1.0)))
     if film:
         parts.append(network_height(jnp.minimum(pairs["film"], LEVELS["film"])))
+    if hair:
+        part = jnp.asarray(pairs["hair"]) / LEVELS["hair"]
+        parts.append(_network(jnp.minimum(part, 1.0)))
     return Batch(
         inputs=jnp.concatenate(parts, axis=-1),
         target=network_height(jnp.asarray(pairs["new_height"])),

@@ -35,7 +35,7 @@ from jaxbrush.stages import (
 from jaxbrush.stages import paint_on as paint_on
 from jaxbrush.stylus import Stroke, stamps_needed
 
-HEIGHT_INPUTS, COLOR_INPUTS, MIXED_INPUTS = 7, 8, 15
+HEIGHT_INPUTS, COLOR_INPUTS, MIXED_INPUTS = 8, 8, 15
 """Channels that the networks are given: height, color, and color of one that mixes."""
 
 

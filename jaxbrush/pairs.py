@@ -97,9 +97,10 @@ class Picture:
     height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
     time, load: (h, w) and trajectory: (h, w, 3) maps of the stroke; sweeps and load of a `Loaded`
     track, time by the clock of `on_way` [mm]. tip: (h, w) height of the latest bristle's tip [mm],
-    up to `COAT`. film: (h, w) height after, if paint did not flow (`laid_film`) [mm]. picked:
-    (h, w, 3), lift: (h, w) what bristles had picked up (`picked_up`). mask: (h, w) 1 where it may
-    have changed something. reached: () whether the brush stayed inside the simulated window.
+    up to `COAT`. film: (h, w) height after, if paint did not flow, hair: (h, w) what was in it
+    last (`laid_film`) [mm]. picked: (h, w, 3), lift: (h, w) what bristles had picked up
+    (`picked_up`). mask: (h, w) 1 where it may have changed something. reached: () whether the
+    brush stayed inside the simulated window.
     """
 
     height: jax.Array
@@ -111,6 +112,7 @@ class Picture:
     load: jax.Array
     tip: jax.Array
     film: jax.Array
+    hair: jax.Array
     picked: jax.Array
     lift: jax.Array
     new_height: jax.Array
@@ -210,7 +212,7 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
 
     Returns:
       (dict of pressure, sweeps by hairs in place of bristles, time by the track's clock, load where
-      the brush came, tip, film, lift (h, w), trajectory and picked (h, w, 3) in sRGB;
+      the brush came, tip, film, hair, lift (h, w), trajectory and picked (h, w, 3) in sRGB;
       TrajectoryMaps).
     """
     picked, lift = picked_up(track, canvas, grid.pixel, COAT)
@@ -218,6 +220,7 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
     carried = jnp.concatenate([to_srgb(picked), lift[..., None], tip[..., None]], axis=-1)
     maps = trajectory_maps(grid, track, carried, edge=edge)
     end = jnp.max(jnp.where(track.valid, track.time, 0.0))
+    film, hair = laid_film(grid, track, track.hairs[0], track.load[0], canvas.height)
     return {
         "pressure": maps.pressure,
         "sweeps": track.hairs[0] * maps.sweeps,
@@ -227,7 +230,8 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
         "picked": maps.color[..., :3],
         "lift": maps.color[..., 3],
         "tip": maps.color[..., 4],
-        "film": laid_film(grid, track, track.hairs[0], track.load[0], canvas.height),
+        "film": film,
+        "hair": hair,
     }, maps
 
 

@@ -107,9 +107,9 @@ class Nets:
 
 @state
 class Drawn:
-    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm], load, tip, film [mm],
-    lift (h, w, 1), trajectory, picked (h, w, 3) in sRGB, as in a training pair; mask: (h, w, 1) as
-    there, 0 off the canvas. share: (h, w, 1) of what is painted in what the canvas
+    """Maps of a stroke on the grid of its box: pressure, sweeps, time [mm], load, tip, film, hair
+    [mm], lift (h, w, 1), trajectory, picked (h, w, 3) in sRGB, as in a training pair; mask:
+    (h, w, 1) as there, 0 off the canvas. share: (h, w, 1) of what is painted in what the canvas
     becomes: 1 where bristles came, falling to 0 within `RIM`. whole: () as in TrajectoryMaps."""
 
     pressure: jax.Array
@@ -118,6 +118,7 @@ class Drawn:
     load: jax.Array
     tip: jax.Array
     film: jax.Array
+    hair: jax.Array
     lift: jax.Array
     trajectory: jax.Array
     picked: jax.Array
@@ -228,11 +229,12 @@ def cut(
       layout: of the box; a Rect is its own.
 
     Returns:
-      dict of height [mm], pressure, sweeps, time, load, tip, film, lift, mask, share (n, size,
-      size, 1), color, trajectory, picked (n, size, size, 3) in sRGB; of a Rect one, of its sides.
+      dict of height [mm], pressure, sweeps, time, load, tip, film, hair, lift, mask, share (n,
+      size, size, 1), color, trajectory, picked (n, size, size, 3) in sRGB; of a Rect one, of its
+      sides.
     """
     names = (
-        "pressure", "sweeps", "time", "load", "tip", "film", "lift", "mask", "share",
+        "pressure", "sweeps", "time", "load", "tip", "film", "hair", "lift", "mask", "share",
         "trajectory", "picked",
     )  # fmt: skip
     field = jnp.concatenate([getattr(drawn, name) for name in names], axis=-1)
@@ -244,7 +246,7 @@ def cut(
     return {
         "height": patches.cut_canvas(canvas.height, corner, sides)[..., None],
         "color": to_srgb(patches.cut_canvas(canvas.color, corner, sides)),
-        **dict(zip(names, jnp.split(field, (1, 2, 3, 4, 5, 6, 7, 8, 9, 12), axis=-1), strict=True)),
+        **dict(zip(names, jnp.split(field, (*range(1, 11), 13), axis=-1), strict=True)),
     }
 
 

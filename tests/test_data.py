@@ -117,7 +117,7 @@ def check_colors(p, inputs):
 def test_batches_are_in_network_scale(folder):
     p = data.load(folder).take("test", [0, 1])
     height = batches.height_batch(p)
-    assert height.inputs.shape == (2, 48, 48, 7) and height.target.shape == (2, 48, 48, 1)
+    assert height.inputs.shape == (2, 48, 48, 8) and height.target.shape == (2, 48, 48, 1)
     color = batches.color_batch(p)
     assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
     assert batches.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
@@ -125,7 +125,7 @@ def test_batches_are_in_network_scale(folder):
     np.testing.assert_array_equal(alone[0].inputs[..., 1], height.inputs[..., 1])
     np.testing.assert_array_equal(alone[1].inputs[..., 1], height.inputs[..., 2])
     np.testing.assert_array_equal(height.inputs[..., 3:4], batches.network_time(p["time"]))
-    few = batches.height_batch(p, time=False, load=False, tip=False, film=False)
+    few = batches.height_batch(p, time=False, load=False, tip=False, film=False, hair=False)
     assert few.inputs.shape[-1] == 3
     # Above all hair where none came.
     high = np.asarray(height.inputs[..., 5:6])
@@ -133,7 +133,13 @@ def test_batches_are_in_network_scale(folder):
     # The film is the canvas where no hair came, and more or less where some did.
     grown = p["film"] - p["height"]
     assert np.all(grown[p["mask"] == 0.0] == 0.0) and grown.max() > 0.1
-    np.testing.assert_allclose(height.inputs[..., 6:], batches.network_height(p["film"]), atol=1e-6)
+    np.testing.assert_allclose(
+        height.inputs[..., 6:7], batches.network_height(p["film"]), atol=1e-6
+    )
+    # Hair is only where it came, and some of it in the paint.
+    hair = np.asarray(height.inputs[..., 7])
+    assert np.all(p["hair"][p["mask"] == 0.0] == 0.0) and p["hair"].max() > 0.01
+    assert hair.min() == -1.0 and hair.max() <= 1.0
     mixed = batches.color_batch(p, mixes=True)
     assert mixed.inputs.shape[-1] == 15
     check_colors(p, np.asarray(mixed.inputs))

@@ -1,4 +1,4 @@
-"""The film that a stroke would leave if paint did not flow, against closed forms."""
+"""The film that a stroke would leave if paint did not flow, and its hair, against closed forms."""
 
 import dataclasses
 import functools
@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.film import laid_film
+from jaxbrush.film import MEMORY, laid_film
 from jaxbrush.paint.state import make_params
 from jaxbrush.raster import make_grid
 
@@ -36,8 +36,16 @@ def pulled(y, high=0.0, step=0.1, length=6.0, start=1.0):
 
 
 @functools.partial(jax.jit, static_argnames="shape")
-def film(track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0)):
+def both(track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0)):
     return laid_film(make_grid(shape, origin, PIXEL), track, hairs, load, height)
+
+
+def film(*args, **named):
+    return both(*args, **named)[0]
+
+
+def hair(*args, **named):
+    return both(*args, **named)[1]
 
 
 BARE = jnp.zeros((32, 80))
@@ -77,18 +85,75 @@ def test_hair_that_rides_higher_leaves_more():
     assert float(high) > 1.2 * float(low)
 
 
+def test_hair_that_leaves_the_paint_gives_nothing():
+    """Lifted by half a millimetre where it stands, it would draw the film up with it."""
+    track = pulled(np.full(60, 2.06), length=3.0)
+    lifted = track.position[-1:] + jnp.linspace(0.05, 0.5, 10)[:, None, None, None] * jnp.asarray(
+        [0.0, 0.0, 1.0]
+    ).reshape(1, 1, 3, 1)
+    position = jnp.concatenate([track.position, lifted])
+    more = dataclasses.replace(
+        track, time=jnp.arange(41.0), position=position, valid=jnp.ones(41, bool)
+    )
+    held = dataclasses.replace(more, valid=jnp.arange(41) < 31)
+    np.testing.assert_allclose(film(more, BARE), film(held, BARE), atol=1e-6)
+    # Pulled on while it rises slowly, it gives what it can.
+    slow = pulled(np.full(60, 2.06))
+    rise = jnp.linspace(0.0, 0.2, 61)[:, None, None, None] * jnp.asarray([0.0, 0.0, 1.0]).reshape(
+        1, 1, 3, 1
+    )
+    risen = dataclasses.replace(slow, position=slow.position + rise)
+    assert float(film(risen, BARE)[16, 48]) > 1.2 * float(film(slow, BARE)[16, 48])
+
+
 def test_grooves_follow_single_hairs():
     # Two rows of hair, six pixels apart.
     after = np.asarray(film(pulled([1.56] * 9 + [2.31] * 9), BARE))[:, 40]
     assert after[12] > 0.9 * EVEN and after[18] > 0.9 * EVEN and after[15] == 0.0
 
 
+def test_hair_in_the_film_has_the_volume_that_is_there():
+    # Hair that stays long enough in deep paint: its volume but for the taper, 0.75 on average.
+    track = pulled([1.5, 2.5], length=0.0, start=3.0)
+    track = jax.tree.map(lambda x: jnp.repeat(x, 200, axis=0), track)
+    deep = jnp.full((32, 80), 0.4)
+    # Way is what counts, so hair that only rests leaves no trace.
+    assert float(hair(track, deep).max()) < 1e-5
+    sway = 0.05 * jnp.sin(jnp.arange(200.0))[:, None, None]
+    track = dataclasses.replace(
+        track, position=track.position.at[:, :, 0].add(sway), valid=jnp.ones(200, bool)
+    )
+    found = np.asarray(hair(track, deep, 2.0))
+    one = np.pi * float(P.hair_radius) ** 2 * float(P.hair_length)
+    assert found.sum() * PIXEL**2 == pytest.approx(2.0 * 2 * 0.75 * one, rel=0.05)
+    # Half of hair at the film's surface is in it, and none of what is well above.
+    level = lambda film: float(hair(track, jnp.full((32, 80), film), 2.0, 0.0).sum())  # noqa: E731
+    assert level(0.0) == pytest.approx(0.5 * found.sum(), rel=0.15)
+    high = dataclasses.replace(track, position=track.position.at[:, :, 2].add(1.0))
+    assert float(hair(high, deep).max()) == 0.0
+
+
+def test_the_last_hair_counts():
+    """One hair that follows twelve over a pixel leaves of them exp(-way / MEMORY), of the way on
+    which it is there: 0.7 mm between its points, and a pixel to a point's both sides."""
+    deep, at = jnp.full((32, 80), 0.4), (16, 30)
+    group, one = (pulled([2.06] * n, start=x) for n, x in ((12, 2.0), (1, 0.0)))
+    position = jnp.concatenate([group.position, one.position], axis=-1)
+    found = [
+        float(hair(t, deep)[at]) for t in (dataclasses.replace(one, position=position), group, one)
+    ]
+    assert found[1] == pytest.approx(12.0 * found[2], rel=1e-3)
+    left = (found[0] - found[2]) / found[1]
+    assert np.exp(-0.93 / MEMORY) < left < np.exp(-0.7 / MEMORY)
+
+
 def test_stamps_twice_as_close_change_little():
     height = 0.1 * jnp.ones((32, 80))
     y = np.random.default_rng(0).uniform(1.5, 2.5, 24)
-    coarse, fine = (np.asarray(film(pulled(y, step=s), height)) for s in (0.1, 0.05))
-    change = np.abs(fine - height).max()
-    assert np.sqrt(np.mean((fine - coarse) ** 2)) < 0.03 * change
+    coarse, fine = (both(pulled(y, step=s), height) for s in (0.1, 0.05))
+    for a, b, before in zip(coarse, fine, (height, 0.0), strict=True):
+        change = np.abs(np.asarray(b) - before).max()
+        assert np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)) < 0.03 * change
 
 
 def test_a_part_of_the_canvas_is_as_the_whole_to_the_bit():

@@ -342,7 +342,7 @@ def test_moments_of_the_whole_stroke_leave_no_seam():
     drawn = stages.Drawn(
         pressure=draw(1) * shade, sweeps=9.0 * draw(1) * shade, time=draw(1) * shade,
         trajectory=draw(3) * jnp.asarray(mask), load=0.8 * jnp.asarray(mask),
-        tip=0.1 * draw(1), film=0.3 * draw(1), lift=draw(1), picked=draw(3),
+        tip=0.1 * draw(1), film=0.3 * draw(1), hair=0.1 * draw(1), lift=draw(1), picked=draw(3),
         mask=jnp.asarray(mask), share=jnp.asarray(mask), whole=jnp.asarray(True),
     )  # fmt: skip
 
