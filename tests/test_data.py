@@ -14,6 +14,7 @@ from jaxbrush import batches, checkpoint, data, pairs
 from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.paint import PaintConfig
+from jaxbrush.painter import HEIGHT_INPUTS
 from jaxbrush.train import Batch
 
 SMALL = pairs.PairConfig(
@@ -228,7 +229,7 @@ def test_long_strokes_fit_their_stamps():
 
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
-    for kind, outputs, channels in (("height", 1, 7), ("color", 3, 15)):
+    for kind, outputs, channels in (("height", 1, HEIGHT_INPUTS), ("color", 3, 15)):
         options = GeneratorConfig(outputs, width=0.05, mixes=kind == "color")
         variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
@@ -250,7 +251,7 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     options = GeneratorConfig(1, width=0.05)
     other = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, 3)))
     checkpoint.export(tmp_path / "other.npz", options, other, {})
-    with pytest.raises(SystemExit, match="other.npz: a network of 3 inputs: expected 7"):
+    with pytest.raises(SystemExit, match=f"of 3 inputs: expected {HEIGHT_INPUTS}"):
         evaluate.main(evaluate.Config((tmp_path / "other.npz",), data=folder, out=tmp_path))
     (tmp_path / "broken.npz").write_bytes(b"weights")
     with pytest.raises(SystemExit, match="broken.npz"):
@@ -301,7 +302,7 @@ def test_no_test_stroke_is_a_training_stroke_of_another_set(folder):
 def test_predicted_heights_are_laid_as_in_use(folder):
     found = data.load(folder)
     config = GeneratorConfig(outputs=1, width=0.05)
-    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, 7)))
+    variables = Generator(config).init(jax.random.key(0), jnp.zeros((1, 48, 48, HEIGHT_INPUTS)))
     network = checkpoint.Exported(variables, config, {})
     index = np.arange(found.count("train"))
     heights = train_network.predicted_heights(found, "train", index, network)

@@ -284,7 +284,7 @@ def test_the_pure_function_is_the_driver():
     """And has a slope, here by the color of the paint."""
     before, stroke = canvas(), jax.tree.map(jnp.asarray, line(*PATHS["inside"]))
     sizes, first = painter.plan(OPTIONS, before, BRUSH, stroke)
-    way = jnp.asarray([0.5, -1.0, 0.7])
+    way = jnp.asarray([0.5, 1.0, 0.7])  # along which slopes do not cancel
 
     def error(shift):
         after, ok = painter.paint_on(
@@ -294,8 +294,10 @@ def test_the_pure_function_is_the_driver():
 
     found = check_slope(error, 2.5e-4)
     want = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
-    np.testing.assert_allclose(found.color, want.color, atol=4e-5)
-    np.testing.assert_allclose(found.height, want.height, atol=4e-5)
+    # Compiled as a whole, rounding moves single bristles by a step (60 nm; `stages.STEPS`), which
+    # changes their film by up to 0.6 um and what these networks make of it by up to 0.08.
+    np.testing.assert_allclose(found.color, want.color, atol=1e-4)
+    np.testing.assert_allclose(found.height, want.height, atol=1.5e-4)
 
 
 @pytest.mark.slow
