@@ -9,6 +9,7 @@ from experiments import compare_engines, engines, paint_scenes, paint_session
 from jaxbrush import checkpoint, recordings
 from jaxbrush.canvas import Canvas, blank, mix_subtractive
 from jaxbrush.models import Generator, GeneratorConfig
+from jaxbrush.painter import COLOR_INPUTS, HEIGHT_INPUTS
 
 PALETTE = np.asarray(list(paint_scenes.PALETTE.values()))
 
@@ -71,7 +72,7 @@ def test_what_is_missing_is_named_before_work_begins(tmp_path):
 @pytest.mark.parametrize("engine", ["neural", "realtime"])
 def test_a_recording_is_painted(engine, tmp_path):
     weights = []
-    for kind, outputs, channels in (("height", 1, 3), ("color", 3, 8)):
+    for kind, outputs, channels in (("height", 1, HEIGHT_INPUTS), ("color", 3, COLOR_INPUTS)):
         options = GeneratorConfig(outputs, width=0.05)
         variables = Generator(options).init(jax.random.key(0), jnp.zeros((1, 8, 8, channels)))
         weights.append(tmp_path / f"{kind}.npz")
