@@ -88,9 +88,8 @@ def test_hair_that_rides_higher_leaves_more():
 def test_hair_that_leaves_the_paint_gives_nothing():
     """Lifted by half a millimetre where it stands, it would draw the film up with it."""
     track = pulled(np.full(60, 2.06), length=3.0)
-    lifted = track.position[-1:] + jnp.linspace(0.05, 0.5, 10)[:, None, None, None] * jnp.asarray(
-        [0.0, 0.0, 1.0]
-    ).reshape(1, 1, 3, 1)
+    lifted = jnp.repeat(track.position[-1:], 10, axis=0)
+    lifted = lifted.at[:, :, 2].add(jnp.linspace(0.05, 0.5, 10)[:, None, None])
     position = jnp.concatenate([track.position, lifted])
     more = dataclasses.replace(
         track, time=jnp.arange(41.0), position=position, valid=jnp.ones(41, bool)
@@ -99,10 +98,8 @@ def test_hair_that_leaves_the_paint_gives_nothing():
     np.testing.assert_allclose(film(more, BARE), film(held, BARE), atol=1e-6)
     # Pulled on while it rises slowly, it gives what it can.
     slow = pulled(np.full(60, 2.06))
-    rise = jnp.linspace(0.0, 0.2, 61)[:, None, None, None] * jnp.asarray([0.0, 0.0, 1.0]).reshape(
-        1, 1, 3, 1
-    )
-    risen = dataclasses.replace(slow, position=slow.position + rise)
+    rise = jnp.linspace(0.0, 0.2, 61)[:, None, None]
+    risen = dataclasses.replace(slow, position=slow.position.at[:, :, 2].add(rise))
     assert float(film(risen, BARE)[16, 48]) > 1.2 * float(film(slow, BARE)[16, 48])
 
 

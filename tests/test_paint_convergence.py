@@ -9,7 +9,14 @@ import numpy as np
 import pytest
 from paint_cases import BRISTLES, CONFIG, SIDE, params_of, stroke, track
 
-from jaxbrush.paint import PaintConfig, empty_canvas, height, load_brush, make_params
+from jaxbrush.paint import (
+    PaintConfig,
+    empty_canvas,
+    for_brush,
+    height,
+    load_brush,
+    make_params,
+)
 from jaxbrush.paint.velocity import viscous
 
 
@@ -116,6 +123,9 @@ def thicker(params, times):
 
 
 def test_fewer_bristles_lay_as_much():
+    few, all_of_them = (for_brush(make_params(), 4.5, 1.4, n) for n in (65, 260))
+    assert float(few.hairs) == pytest.approx(4.0) and float(all_of_them.hairs) == pytest.approx(1.0)
+    assert few.hair_radius == all_of_them.hair_radius and few.coat_full == all_of_them.coat_full
     moves = track()
 
     def laid(params, every, first):
