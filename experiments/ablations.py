@@ -3,7 +3,7 @@
 Every variant is trained from nothing on the same pairs for the same number of updates (or minutes),
 and charted by its error on test pairs against the time it takes to paint one. The default comes
 again with another seed: differences smaller than that are noise. Variants that are done are not
-trained again.
+trained again. A sheet shows the same strokes by all of them.
 
 python -m experiments.ablations                        # height, about 5 minutes a variant
 python -m experiments.ablations --kind color --steps 4000
@@ -15,11 +15,13 @@ import json
 from pathlib import Path
 from typing import Annotated, Literal
 
+import jax
 import matplotlib.pyplot as plt
+import numpy as np
 import tyro
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from experiments import evaluate, train_network
+from experiments import evaluate, make_dataset, train_network
 from experiments.common import (
     COLORS,
     INK,
@@ -29,16 +31,22 @@ from experiments.common import (
     save_figure,
     write_run,
 )
-from jaxbrush import checkpoint
+from jaxbrush import batches, checkpoint, data
+from jaxbrush.canvas import Canvas, from_srgb
+from jaxbrush.render import picture, shade
 
 SIDE = 128
 """Of the picture whose time is taken [pixels]."""
+LOOK = 3
+"""Test pairs on the sheet."""
 _BOTH = {
     "another seed": {"seed": 1},
     "width 1/8": {"width": 0.125},
     "width 1/2": {"width": 0.5},
     "no discriminator": {"gan": 0.0},
     "the paper's 10 L1 : 1 cGAN": {"gan": 1.0},
+    "cGAN alone": {"l1": 0.0, "gan": 1.0},
+    "transposed convolution": {"upsampling": "transposed"},
     "no instance normalisation": {"norm": "none"},
     "no time map": {"time": False},
 }
@@ -101,11 +109,16 @@ def chosen(options: Config) -> dict[str, dict]:
     return {name: known[name] for name in names}
 
 
+def place(folder: Path, name: str) -> Path:
+    """The folder of a variant."""
+    return folder / name.replace("/", "_")
+
+
 def options_of(options: Config, folder: Path, name: str, changes: dict) -> train_network.Config:
     """How a variant is trained."""
     steps = None if options.minutes is not None else options.steps
     return train_network.Config(
-        **changes, preset=options.preset, data=options.data, out=folder / name.replace("/", "_"),
+        **changes, preset=options.preset, data=options.data, out=place(folder, name),
         steps=20 if options.quick else steps, minutes=None if options.quick else options.minutes,
         check_every=10 if options.quick else 500,
     )  # fmt: skip
@@ -120,6 +133,60 @@ def _done(how: train_network.Config) -> dict | None:
         return None
     same = json.loads(json.dumps(dataclasses.asdict(how), default=str))
     return found if config == same else None
+
+
+def trained(kind: str, how: train_network.Config, title: str) -> dict:
+    """What a network came to; trains it, unless it was trained like this before.
+
+    Raises:
+      SystemExit: a folder with a network that was trained in another way.
+    """
+    found = _done(how)
+    if found is not None:
+        return found
+    console.print(title)
+    if (how.out / "metrics.json").exists():
+        raise SystemExit(f"{how.out}: was trained in another way; use another --out")
+    resumed = dataclasses.replace(how, resume=(how.out / "checkpoints").exists())
+    found = train_network.main(kind, resumed)
+    write_run(how.out, how, found)
+    return found
+
+
+def in_light(height, color, pixel: float) -> np.ndarray:
+    """Pictures (n, h, w, 3) uint8 of heights (n, h, w) [mm] and sRGB colors (n, h, w, 3)."""
+    lit = jax.vmap(lambda h, c: shade(Canvas(h, from_srgb(c)), pixel))(height, color)
+    return np.stack([picture(x) for x in lit])
+
+
+def sheet(kind: str, nets: dict[str, checkpoint.Exported], found: data.Dataset, path: Path):
+    """The same strokes by simulator and variants, in light; of height networks in true color, of
+    color networks on true height (paper Figures 3, 4, 5, 8 and 11)."""
+    index = np.linspace(0, found.count("test") - 1, LOOK).astype(int)
+    raw = found.take("test", index)
+    pixel, level = found.options.pairs.paint.pixel, batches.LEVELS["height"]
+
+    def lit(change):
+        seen = raw | change
+        strip = in_light(seen["new_height"][..., 0], seen["new_color"], pixel)
+        return np.concatenate(list(strip), axis=1)
+
+    before = {"new_height": raw["height"], "new_color": raw["color"]}
+    cells = {"before": lit(before), "simulator": lit({})}
+    for name, net in nets.items():
+        seen = train_network.Config(**net.card["inputs"])
+        pairs = train_network.pairs_of(found, "test", index, kind, seen)
+        laid = 0.5 * (evaluate.predicted(net, pairs) + 1.0)
+        cells[name] = lit({"new_height": level * laid} if kind == "height" else {"new_color": laid})
+    across = 3
+    down = -(-len(cells) // across)
+    figure, axes = plt.subplots(down, across, figsize=(3.9 * across, 1.45 * down))
+    for axis in axes.flat:
+        axis.axis("off")
+    for axis, (name, cell) in zip(axes.flat, cells.items(), strict=False):
+        axis.imshow(cell)
+        axis.set_title(name, fontsize=8)
+    save_figure(figure, path)
 
 
 def chart(kind: str, rows: list[dict], path: Path):
@@ -146,19 +213,13 @@ def chart(kind: str, rows: list[dict], path: Path):
 def main(options: Config) -> None:
     variants = chosen(options)
     folder = results_folder(f"ablations_{options.kind}", options.out)
-    rows = []
+    rows, nets = [], {}
     for number, (name, changes) in enumerate(variants.items(), 1):
         how = options_of(options, folder, name, changes)
-        found = _done(how)
-        if found is None:
-            console.print(f"{number} of {len(variants)}: {name}")
-            if how.out.exists() and (how.out / "metrics.json").exists():
-                raise SystemExit(f"{how.out}: was trained in another way; use another --out")
-            resumed = dataclasses.replace(how, resume=(how.out / "checkpoints").exists())
-            found = train_network.main(options.kind, resumed)
-            write_run(how.out, how, found)
+        found = trained(options.kind, how, f"{number} of {len(variants)}: {name}")
         errors = found["errors"]["the network"]
-        ms = evaluate.milliseconds(checkpoint.load(how.out / f"{options.kind}.npz"), SIDE)
+        nets[name] = checkpoint.load(how.out / f"{options.kind}.npz")
+        ms = evaluate.milliseconds(nets[name], SIDE)
         rows.append({"name": name, "ms": ms, "masked": errors["rmse_masked"], "steps":
                      found["steps"], "best": found["best_step"], "errors": errors})  # fmt: skip
     last = "volume_bias" if options.kind == "height" else "delta_e"
@@ -169,9 +230,11 @@ def main(options: Config) -> None:
     ]
     columns = ["variant", "ms", "updates", "best", "masked", "whole", last.replace("_", " ")]
     chart(options.kind, rows, folder / "ablations.png")
+    stored = data.load(make_dataset.build(options.preset, options.data))
+    sheet(options.kind, nets, stored, folder / "sheet.png")
     write_run(folder, options, {"rows": rows})
     print_table(f"{options.kind}: variants, test pairs", columns, table)
-    console.print(f"chart: {folder / 'ablations.png'}")
+    console.print(f"chart: {folder / 'ablations.png'}   pictures: {folder / 'sheet.png'}")
 
 
 if __name__ == "__main__":

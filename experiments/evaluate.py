@@ -21,7 +21,7 @@ from experiments.evaluation import Pairs, Scale
 from jaxbrush import batches, checkpoint, data
 from jaxbrush.models import Generator, inputs_of
 
-KINDS = {1: "height", 3: "color"}
+KINDS = {count: kind for kind, count in training.OUTPUTS.items()}
 SHIPPED = Path("checkpoints")
 
 
@@ -52,7 +52,8 @@ def predicted(exported: checkpoint.Exported, pairs: Pairs) -> np.ndarray:
 def with_height(pairs: Pairs, height) -> Pairs:
     """Color pairs whose last input, the new height, is another one, (n, h, w, 1)."""
     inputs = np.concatenate([np.asarray(pairs.batch.inputs)[..., :-1], height], -1)
-    return Pairs(dataclasses.replace(pairs.batch, inputs=jnp.asarray(inputs)), pairs.preview)
+    batch = dataclasses.replace(pairs.batch, inputs=jnp.asarray(inputs))
+    return dataclasses.replace(pairs, batch=batch)
 
 
 def milliseconds(exported: checkpoint.Exported, size: int) -> float:
@@ -87,28 +88,24 @@ def main(options: Config) -> None:
         seen = train_network.Config(**exported.card.get("inputs", {}))
         pairs = train_network.pairs_of(found, options.split, index, kind, seen)
         try:
-            rows = evaluation.compare(kind, predicted(exported, pairs), pairs, scale)
+            pictures = predicted(exported, pairs)
         except ValueError as error:
             raise SystemExit(f"{path}: {error}") from error
+        parts = evaluation.parts(kind, pictures, pairs)
+        tables = {part: evaluation.compare(part, *each, scale) for part, each in parts.items()}
         if kind == "color" and chained and seen.height:
             laid = train_network.predicted_heights(found, options.split, index, chained)
             used = with_height(pairs, batches.network_height(laid))
             picture = predicted(exported, used)
-            rows = {
-                "on predicted height": evaluation.errors(kind, picture, used.batch, scale)
-            } | rows
-        training.sample_grid(
-            kind, predicted(exported, pairs[:6]), pairs[:6], folder / f"{path.stem}.png"
-        )
-        spent = milliseconds(exported, found.options.pairs.size)
-        results[str(path)] = {"errors": rows, "milliseconds": spent}
-        names, texts = evaluation.table(kind, rows)
+            in_use = evaluation.errors(kind, picture, used.batch, scale)
+            tables[kind] = {"on predicted height": in_use} | tables[kind]
+        training.sample_grid(kind, pictures[:6], pairs[:6], folder / f"{path.stem}.png")
         side = found.options.pairs.size
-        print_table(
-            f"{path}: {len(index)} {options.split} pairs, {spent:.0f} ms for {side} x {side}",
-            names,
-            texts,
-        )
+        spent = milliseconds(exported, side)
+        results[str(path)] = {"errors": tables.get(kind, tables), "milliseconds": spent}
+        for part, rows in tables.items():
+            about = f"{part} of {len(index)} {options.split} pairs, {spent:.0f} ms for"
+            print_table(f"{path}: {about} {side} x {side}", *evaluation.table(part, rows))
     write_run(folder, options, results)
 
 

@@ -29,11 +29,12 @@ class Scale:
 
 @dataclasses.dataclass(frozen=True)
 class Pairs:
-    """Pairs in network scale. batch: all of them, float32 arrays on the host or the device; the
-    first channels of the inputs are the background of the target. preview: (n, h, w, k), what the
-    stroke's maps alone give."""
+    """Pairs in network scale. batch: all of them, float32 arrays on the host or the device.
+    background: (n, h, w, k) what was there before. preview: (n, h, w, k), what the stroke's maps
+    alone give."""
 
     batch: Batch
+    background: np.ndarray | jax.Array
     preview: np.ndarray | jax.Array
 
     def __len__(self):
@@ -50,12 +51,8 @@ class Pairs:
         """The pairs of these numbers, on the host."""
         return jax.tree.map(lambda x: np.asarray(x)[index], self.batch)
 
-    @property
-    def background(self):
-        return self.batch.inputs[..., : self.batch.target.shape[-1]]
 
-
-jax.tree_util.register_dataclass(Pairs, ["batch", "preview"], [])
+jax.tree_util.register_dataclass(Pairs, ["batch", "background", "preview"], [])
 
 
 def _common(found, true, mask):
@@ -163,6 +160,18 @@ def paint(options: GeneratorConfig, variables: dict, batch: Batch) -> np.ndarray
         few = jax.tree.map(lambda x, piece=piece: jnp.asarray(x[piece]), batch)
         out.append(jax.device_get(_painted(options, variables, few)))
     return np.concatenate(out)
+
+
+def parts(kind: str, found, pairs: Pairs) -> dict[str, tuple[np.ndarray, Pairs]]:
+    """Pictures and pairs of height and color, by their names: of a single network both."""
+    if kind != "single":
+        return {kind: (found, pairs)}
+    split = {}
+    for name, channels in (("color", slice(0, 3)), ("height", slice(3, 4))):
+        of = lambda x, which=channels: x[..., which]  # noqa: E731
+        batch = dataclasses.replace(pairs.batch, target=of(pairs.batch.target))
+        split[name] = of(found), Pairs(batch, of(pairs.background), of(pairs.preview))
+    return split
 
 
 def compare(kind: str, found, pairs: Pairs, scale: Scale) -> dict[str, dict]:

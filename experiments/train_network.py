@@ -1,4 +1,5 @@
-"""What train_height and train_color are: data set, training, errors, pictures, weights."""
+"""What train_height and train_color are: data set, training, errors, pictures, weights. Also of one
+network that paints both, for `experiments.single_or_twins`."""
 
 import dataclasses
 import sys
@@ -80,9 +81,11 @@ class Stored:
 
 def batch_of(raw: dict, kind: str, options: Config):
     """Inputs, target and mask of a network, as the options ask for."""
+    told = (options.hand, options.time, options.load, options.tip, options.film, options.hair)
     if kind == "height":
-        told = (options.hand, options.time, options.load, options.tip, options.film, options.hair)
         return batches.height_batch(raw, *told)
+    if kind == "single":
+        return batches.single_batch(raw, options.mixes, *told)
     return batches.color_batch(raw, options.time, options.height, options.mixes)
 
 
@@ -90,11 +93,15 @@ def pairs_of(found: data.Dataset, split: str, index, kind: str, options: Config)
     """Pairs of a data set in network scale."""
     raw = found.take(split, index)
     shown = batches.preview(raw)
-    height = kind == "height"
-    preview = (
-        batches.network_height(shown["new_height"]) if height else 2.0 * shown["new_color"] - 1.0
-    )
-    return Pairs(batch_of(raw, kind, options), preview)
+
+    def pictures(height, color):
+        parts = {"height": batches.network_height(height), "color": 2.0 * color - 1.0}
+        both = np.concatenate([parts["color"], parts["height"]], -1)
+        return np.asarray(parts.get(kind, both))
+
+    background = pictures(raw["height"], raw["color"])
+    preview = pictures(shown["new_height"], shown["new_color"])
+    return Pairs(batch_of(raw, kind, options), background, preview)
 
 
 _faded = jax.jit(jax.vmap(lambda cover: stages.faded(cover)[0]))

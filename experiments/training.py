@@ -1,7 +1,6 @@
 """The loop that trains a network and reports on it: what train_height and train_color share."""
 
 import dataclasses
-import functools
 import json
 import os
 import time
@@ -14,15 +13,15 @@ import jax.numpy as jnp
 import numpy as np
 from rich.progress import BarColumn, Progress, TextColumn, TimeRemainingColumn
 
-from experiments import evaluation
+from experiments import evaluation, feed
 from experiments.common import console, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
-from jaxbrush import checkpoint, mixing
-from jaxbrush.batches import recolored
+from jaxbrush import checkpoint
 from jaxbrush.models import DiscriminatorConfig, GeneratorConfig, folded, inputs_of
 from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
 
-OUTPUTS = {"height": 1, "color": 3}
+OUTPUTS = {"height": 1, "color": 3, "single": 4}
+"""Channels of the networks; the single one paints color and height (paper Figure 6)."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -98,11 +97,6 @@ def falling(fall: float, spent: float) -> float:
     return float(np.clip((1.0 - rung) / max(fall, 1e-9), 0.5 / RUNGS, 1.0))
 
 
-def mixes(options: Options, kind: str) -> bool:
-    """Whether the network that the options ask for mixes colors."""
-    return kind == "color" and options.mixes
-
-
 def train_config(options: Options, kind: str) -> TrainConfig:
     """The networks that the options ask for."""
     dtype = "bfloat16" if options.bf16 else "float32"
@@ -112,82 +106,25 @@ def train_config(options: Options, kind: str) -> TrainConfig:
     judge = DiscriminatorConfig(options.discriminator_width, opposed, dtype)
     return TrainConfig(
         GeneratorConfig(
-            OUTPUTS[kind], options.width, norm, options.upsampling, dtype, mixes(options, kind)
+            OUTPUTS[kind], options.width, norm, options.upsampling, dtype, feed.mixes(options, kind)
         ),
         judge if options.gan > 0.0 else None,
         options.average,
     )
 
 
-@functools.lru_cache(maxsize=2)
-def _order(seed: int, epoch: int, count: int) -> np.ndarray:
-    return np.random.default_rng((seed, epoch)).permutation(count)
-
-
-def indices(seed: int, step: int, size: int, count: int) -> np.ndarray:
-    """Numbers of the pairs that update `step` sees: a pure function, so that a resumed run sees
-    the same ones. Every pair once before any comes again."""
-    at = range(step * size, (step + 1) * size)
-    return np.array([_order(seed, p // count, count)[p % count] for p in at], np.int32)
-
-
-def turned(batch, which):
-    """A batch (n, h, w, c) of square pictures, mirrored and turned: one of 8 ways."""
-    flips = [lambda x: x, lambda x: jnp.flip(x, 1), lambda x: jnp.flip(x, 2),
-             lambda x: jnp.flip(x, (1, 2))]  # fmt: skip
-    ways = flips + [lambda x, f=f: f(jnp.swapaxes(x, 1, 2)) for f in flips]
-    every = [lambda b, w=w: jax.tree.map(w, b) for w in ways]
-    return jax.lax.switch(which, every, batch)
-
-
-RECOLOR = 0.7
-"""Largest change of the logarithm of absorption over scattering, in each channel."""
-
-
-def make_batches(pairs: Pairs, options: Options, kind: str = "height"):
-    """`batches(step) -> (Batch on the device, numbers of its pairs)`; the same whether all pairs
-    are on the device or not."""
-    device = jax.devices()[0]
-    resident = pairs.nbytes <= options.resident * 1e9
-    data = jax.device_put(pairs.take(np.arange(len(pairs))), device) if resident else None
-    gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
-    # The paint knows no direction, so every pair is worth eight.
-    turn = jax.jit(turned)
-    change = jax.jit(functools.partial(recolored, mixes=mixes(options, kind)))
-    recolor = kind == "color" and options.recolor
-
-    def batches(step: int):
-        index = indices(options.seed, step, options.batch, len(pairs))
-        if resident:
-            found = gather(data, jax.device_put(index, device))
-        else:
-            found = jax.device_put(pairs.take(index), device)
-        if options.turns:
-            which = np.random.default_rng((options.seed, step)).integers(8)
-            found = turn(found, jax.device_put(np.int32(which), device))
-        if recolor:
-            draw = np.random.default_rng((options.seed, step, 1))
-            channels = draw.permutation(3).astype(np.int32)
-            scale = np.exp(draw.uniform(-RECOLOR, RECOLOR, 3)).astype(np.float32)
-            found = change(found, *jax.device_put((channels, scale), device))
-        return found, index
-
-    return batches
-
-
 def sample_grid(kind: str, found, pairs: Pairs, path: Path):
-    """Saves a row a pair: background, map of the stroke (of colors that mix, what bristles carry),
-    network, truth, difference times 4."""
-    inputs, count = pairs.batch.inputs, OUTPUTS[kind]
-    first = mixing.COLORS - 3 if kind == "color" and inputs.shape[-1] > mixing.COLORS else count
-    stroke = inputs[..., first : first + count]
-    difference = np.abs(np.asarray(found) - np.asarray(pairs.batch.target)) * 4.0 - 1.0
-    columns = (pairs.background, stroke, found, pairs.batch.target, difference)
+    """Saves a row a pair: background, preview of the stroke, network, truth, difference times 4; of
+    a network for color and height first those of one, then of the other."""
     tiles = []
-    for picture in columns:
-        picture = np.clip(0.5 * (np.asarray(picture) + 1.0), 0.0, 1.0)
-        picture = np.pad(picture, ((0, 0), (2, 2), (2, 2), (0, 0)), constant_values=1.0)
-        tiles.append(np.concatenate(list(picture), axis=0))
+    for picture, part in evaluation.parts(kind, found, pairs).values():
+        truth = np.asarray(part.batch.target)
+        difference = np.abs(np.asarray(picture) - truth) * 4.0 - 1.0
+        for column in (part.background, part.preview, picture, truth, difference):
+            column = np.clip(0.5 * (np.asarray(column) + 1.0), 0.0, 1.0)
+            column = np.pad(column, ((0, 0), (2, 2), (2, 2), (0, 0)), constant_values=1.0)
+            column = np.concatenate(list(column), axis=0)
+            tiles.append(np.broadcast_to(column, (*column.shape[:2], 3)))
     sheet = (255.0 * np.concatenate(tiles, axis=1) + 0.5).astype(np.uint8)
     coded, data = cv2.imencode(".png", sheet[..., ::-1])
     if not coded:
@@ -299,7 +236,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
     chosen = train_config(options, kind)
     init, update = make_train(chosen)
     params = make_params(options.l1, options.gan, options.rate, options.discriminator_rate)
-    batches = make_batches(train, options, kind)
+    batches = feed.make_batches(train, options, kind)
     held = jax.device_put(held)
     seconds = np.inf if options.minutes is None else 60.0 * options.minutes
     last_step = np.inf if options.steps is None else options.steps
@@ -402,7 +339,8 @@ def fit(
         knows what the network is given.
 
     Returns:
-      What metrics.json holds: numbers of the run and, under "errors", those of `compare`.
+      What metrics.json holds: numbers of the run and, under "errors", those of `compare`, of a
+      single network those of "height" and "color".
 
     Raises:
       as `run`.
@@ -411,7 +349,13 @@ def fit(
     chosen, state, numbers = run(options, kind, train, held, folder)
     variables = inference_variables(state)
     found = evaluation.paint(chosen.generator, variables, test.batch)
-    rows = evaluation.compare(kind, found, test, scale)
+    parts = evaluation.parts(kind, found, test)
+    tables = {part: evaluation.compare(part, *each, scale) for part, each in parts.items()}
+
+    def of(row):
+        rows = {part: table[row] for part, table in tables.items()}
+        return rows.get(kind, rows)
+
     sample_grid(kind, found[:6], test[:6], folder / "samples.png")
     card = {
         "command": command,
@@ -421,13 +365,15 @@ def fit(
         "steps": numbers["best_step"],
         "device": f"{jax.devices()[0]}, {os.cpu_count()} cores",
         "seconds": round(numbers["seconds"], 1),
-        "errors (network scale unless said otherwise)": rows["the network"],
-        "errors of copying the background": rows["copy the background"],
-        "errors of the preview stroke": rows["the preview stroke"],
+        "errors (network scale unless said otherwise)": of("the network"),
+        "errors of copying the background": of("copy the background"),
+        "errors of the preview stroke": of("the preview stroke"),
     }
     checkpoint.export(folder / f"{kind}.npz", chosen.generator, variables, card)
-    write_run(folder, options, {"kind": kind, **numbers, "errors": rows})
-    names, texts = evaluation.table(kind, rows)
-    title = f"{kind}: {numbers['steps']} steps, best {numbers['best_step']}, {len(test)} test pairs"
-    print_table(title, names, texts, marked=0)
-    return {"kind": kind, **numbers, "errors": rows}
+    numbers = {"kind": kind, **numbers, "errors": tables.get(kind, tables)}
+    write_run(folder, options, numbers)
+    for part, rows in tables.items():
+        names, texts = evaluation.table(part, rows)
+        done = f"{numbers['steps']} steps, best {numbers['best_step']}, {len(test)} test pairs"
+        print_table(f"{part}: {done}", names, texts, marked=0)
+    return numbers

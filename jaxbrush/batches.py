@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush.canvas import absorbed, from_srgb, reflected, to_srgb
+from jaxbrush.mixing import COLORS
 from jaxbrush.pairs import COAT
 from jaxbrush.train import Batch
 
@@ -152,8 +153,24 @@ def color_batch(
     )
 
 
+def single_batch(pairs: dict, mixes: bool = False, *told, **kwargs) -> Batch:
+    """Inputs and target of one network for color and height (paper Figure 6): colors and, for one
+    that mixes, how much was picked up; all that the height network is told (`height_batch`, whose
+    arguments follow) -> new color and new height."""
+    color = color_batch(pairs, time=False, height=False, mixes=mixes)
+    height = height_batch(pairs, *told, **kwargs)
+    # The rest of its inputs are among those of the height network.
+    own = color.inputs[..., : COLORS + 1] if mixes else color.inputs
+    return Batch(
+        inputs=jnp.concatenate([own, height.inputs], axis=-1),
+        target=jnp.concatenate([color.target, height.target], axis=-1),
+        mask=height.mask,
+    )
+
+
 def recolored(batch: Batch, channels, scale, mixes: bool = False) -> Batch:
-    """A batch of the color network as if all had been painted in other colors.
+    """A batch of the color network, or of one for color and height, as if all had been painted in
+    other colors.
 
     Paint mixes channel by channel, by the mean of a power of its absorption over scattering
     (`canvas.mix_subtractive`): to permute channels and to scale this ratio is exact, but where a
@@ -176,7 +193,9 @@ def recolored(batch: Batch, channels, scale, mixes: bool = False) -> Batch:
         none = jnp.all(stroke == -1.0, axis=-1, keepdims=True)
         colors = [change(before), jnp.where(none, -1.0, change(stroke))]
     inputs = jnp.concatenate([*colors, rest], axis=-1)
-    return dataclasses.replace(batch, inputs=inputs, target=change(batch.target))
+    color, height = jnp.split(batch.target, (3,), axis=-1)
+    target = jnp.concatenate([change(color), height], axis=-1)
+    return dataclasses.replace(batch, inputs=inputs, target=target)
 
 
 PREVIEW_FILM = 0.22

@@ -53,10 +53,10 @@ def _check(options):
 
 @config
 class GeneratorConfig:
-    """outputs: channels, 1 for height, 3 for color. width: factor on the channels between. norm:
-    one of NORMS. upsampling: "resize" or "transposed". dtype: of the convolutions; parameters,
-    moments and the output are float32 in any case. mixes: of color, whether the network says how
-    much of which paint is seen (`mixing`), in place of a color."""
+    """outputs: channels, 1 for height, 3 for color, 4 for color and height. width: factor on the
+    channels between. norm: one of NORMS. upsampling: "resize" or "transposed". dtype: of the
+    convolutions; parameters, moments and the output are float32 in any case. mixes: of color,
+    whether the network says how much of which paint is seen (`mixing`), in place of a color."""
 
     outputs: int = 1
     width: float = 1.0
@@ -69,8 +69,8 @@ class GeneratorConfig:
         _check(self)
         if self.outputs < 1:
             raise ValueError(f"outputs = {self.outputs}: expected at least 1")
-        if self.mixes and self.outputs != 3:
-            raise ValueError(f"mixes with outputs = {self.outputs}: expected 3, a color")
+        if self.mixes and self.outputs not in (3, 4):
+            raise ValueError(f"mixes with outputs = {self.outputs}: expected 3, a color, or 4")
         if self.upsampling not in UPSAMPLING:
             raise ValueError(
                 f"upsampling = {self.upsampling!r}: expected one of {tuple(UPSAMPLING)}"
@@ -193,8 +193,9 @@ class Generator(nn.Module):
     """C64S1-ReLU-C128S2-N-ReLU-C128S1-N-ReLU-C256S2-N, then
     ReLU-RC128S2-N-ReLU-RC128S1-N-ReLU-RC64S2-N-ReLU-RCkS1-tanh, with skips between mirror layers.
 
-    One that mixes has as many filters in its last layer as there are paints, and no tanh; its first
-    layer does not see the colors among its inputs, only the mixture does (`mixing`).
+    One that mixes has as many filters in its last layer as there are paints, and no tanh (but for
+    the height, where it paints that, too); its first layer does not see the colors among its
+    inputs, only the mixture does (`mixing`).
 
     Call it by `apply(variables, inputs, weights, pooled=, train=)`:
 
@@ -239,9 +240,12 @@ class Generator(nn.Module):
         x = layer("decode1", x, 128, up=c.upsampling)
         x = layer("decode2", join(x, third), 128)
         x = layer("decode3", join(x, second), 64, up=c.upsampling)
-        outputs = mixing.PAINTS if c.mixes else c.outputs
+        outputs = mixing.PAINTS + c.outputs - 3 if c.mixes else c.outputs
         x = Conv(outputs, c.dtype, name="decode4")(join(x, first)).astype(jnp.float32)
-        return mixing.mix(x, inputs) if c.mixes else jnp.tanh(x)
+        if not c.mixes:
+            return jnp.tanh(x)
+        color = mixing.mix(x[..., : mixing.PAINTS], inputs)
+        return color if c.outputs == 3 else join(color, jnp.tanh(x[..., mixing.PAINTS :]))
 
 
 def inputs_of(options: GeneratorConfig, params: dict) -> int:

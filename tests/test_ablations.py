@@ -4,7 +4,8 @@ import json
 
 import pytest
 
-from experiments import ablations
+from experiments import ablations, single_or_twins
+from experiments.single_or_twins import ALONE
 from jaxbrush import data, pairs
 from jaxbrush.paint import PaintConfig
 
@@ -53,3 +54,16 @@ def test_every_variant_is_something_that_training_knows(kind, tmp_path):
     ]
     assert len({way.out for way in ways}) == len(ways) > 8
     assert all(way.steps == options.steps and way.minutes is None for way in ways)
+
+
+@pytest.mark.slow
+def test_one_network_is_compared_with_two(folder, tmp_path, capsys):
+    single_or_twins.main(single_or_twins.Config(data=folder, out=tmp_path, quick=True))
+    rows = {r["name"]: r for r in json.loads((tmp_path / "metrics.json").read_text())["rows"]}
+    assert set(rows) == {"twins", "twins, painted"} | {n for n in ALONE if n.startswith("single")}
+    assert all(0.0 < r["height"] < 2.0 and 0.0 < r["color"] < 2.0 for r in rows.values())
+    # Twins share the height network, and differ in the color.
+    assert rows["twins"]["height"] == rows["twins, painted"]["height"]
+    assert rows["twins"]["color"] != rows["twins, painted"]["color"]
+    for name in ("chart.png", "sheet.png"):
+        assert (tmp_path / name).stat().st_size > 5000

@@ -141,7 +141,15 @@ def test_batches_are_in_network_scale(folder):
     hair = np.asarray(height.inputs[..., 7])
     assert np.all(p["hair"][p["mask"] == 0.0] == 0.0) and p["hair"].max() > 0.01
     assert hair.min() == -1.0 and hair.max() <= 1.0
+    # One network for both is told what either is, but for the height that it is to predict.
+    painted, mixes = batches.single_batch(p), batches.single_batch(p, True, "pressure", hair=False)
+    np.testing.assert_array_equal(painted.inputs[..., 6:], height.inputs)
+    np.testing.assert_array_equal(painted.target[..., :3], color.target)
+    np.testing.assert_array_equal(painted.target[..., 3:], height.target)
+    told = batches.height_batch(p, "pressure", hair=False).inputs
+    np.testing.assert_array_equal(mixes.inputs[..., 10:], told)
     mixed = batches.color_batch(p, mixes=True)
+    np.testing.assert_array_equal(mixes.inputs[..., :10], mixed.inputs[..., :10])
     assert mixed.inputs.shape[-1] == 15
     check_colors(p, np.asarray(mixed.inputs))
     # One load a stroke, where the brush came.
@@ -154,7 +162,7 @@ def test_batches_are_in_network_scale(folder):
     np.testing.assert_array_equal(color.inputs[..., 6], batches.network_time(p["time"])[..., 0])
     with pytest.raises(ValueError, match="hand = 'left'"):
         batches.height_batch(p, "left")
-    for batch in (height, color, *alone):
+    for batch in (height, color, painted, mixes, *alone):
         for x in jax.tree.leaves(batch):
             assert x.dtype == np.float32
             assert float(x.min()) >= -1.0 and float(x.max()) <= 1.0

@@ -160,6 +160,22 @@ def test_a_network_that_mixes_is_a_color_network():
     assert variables["params"]["decode4"]["kernel"].shape[3] == mixing.PAINTS
 
 
+def test_one_network_for_color_and_height_mixes_the_color_alone():
+    rng = np.random.default_rng(9)
+    inputs = inputs_like(rng)
+    run = Generator(GeneratorConfig(outputs=4, width=0.05, norm="none", mixes=True))
+    variables = run.init(jax.random.key(0), inputs)
+    found = run.apply(variables, inputs)
+    assert variables["params"]["decode4"]["kernel"].shape[3] == mixing.PAINTS + 1
+    batch = Batch(inputs=inputs, target=found, mask=inputs[..., :1])
+    channels, scale = np.array([1, 2, 0]), jnp.asarray([0.7, 1.4, 1.0])
+    other = recolored(batch, channels, scale, mixes=True)
+    np.testing.assert_allclose(run.apply(variables, other.inputs), other.target, atol=1e-4)
+    np.testing.assert_array_equal(other.target[..., 3], found[..., 3])
+    with pytest.raises(ValueError, match="mixes with outputs = 1"):
+        GeneratorConfig(outputs=1, mixes=True)
+
+
 def test_low_precision_keeps_white_white():
     """Only convolutions are in bfloat16; the mixture is not."""
     white = 0.8

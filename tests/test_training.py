@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from experiments import evaluation, training
+from experiments import evaluation, feed, training
 from experiments.evaluation import Pairs, Scale
 from experiments.training import Options
 from jaxbrush import checkpoint
@@ -42,27 +42,28 @@ def toy(count, side=32, seed=0, kind="height"):
     preview = np.clip(background + 0.3 * (pressure > 0.0), 0.0, 1.0).astype(np.float32)
     scaled = lambda x: 2.0 * x - 1.0  # noqa: E731
     inputs = np.concatenate([background, pressure], -1)
-    if kind == "color":
+    if kind != "height":
+        count = training.OUTPUTS[kind]
         inputs = np.concatenate([background.repeat(3, -1), laid.repeat(3, -1), pressure, after], -1)
-        after, preview = after.repeat(3, -1), preview.repeat(3, -1)
-    return Pairs(Batch(scaled(inputs), scaled(after), mask), scaled(preview))
+        background, after, preview = (x.repeat(count, -1) for x in (background, after, preview))
+    return Pairs(Batch(scaled(inputs), scaled(after), mask), scaled(background), scaled(preview))
 
 
 def test_every_pair_comes_once_an_epoch_and_order_is_a_function_of_the_step():
     count, size = 7, 3
-    seen = np.concatenate([training.indices(5, step, size, count) for step in range(7)])
+    seen = np.concatenate([feed.indices(5, step, size, count) for step in range(7)])
     for epoch in range(3):
         assert sorted(seen[7 * epoch : 7 * epoch + 7]) == list(range(7))
     assert not np.array_equal(seen[:7], seen[7:14])
-    np.testing.assert_array_equal(training.indices(5, 4, size, count), seen[12:15])
-    assert not np.array_equal(training.indices(6, 4, size, count), seen[12:15])
+    np.testing.assert_array_equal(feed.indices(5, 4, size, count), seen[12:15])
+    assert not np.array_equal(feed.indices(6, 4, size, count), seen[12:15])
 
 
 def test_streamed_and_resident_pairs_give_the_same_batches():
     pairs = toy(5, side=8)
     options = dataclasses.replace(SMALL, batch=2, turns=False)
-    resident = training.make_batches(pairs, options)
-    streamed = training.make_batches(pairs, dataclasses.replace(options, resident=0.0))
+    resident = feed.make_batches(pairs, options)
+    streamed = feed.make_batches(pairs, dataclasses.replace(options, resident=0.0))
     for step in (0, 3):
         (a, i), (b, j) = resident(step), streamed(step)
         np.testing.assert_array_equal(i, j)
@@ -73,8 +74,8 @@ def test_streamed_and_resident_pairs_give_the_same_batches():
 def test_color_pairs_are_recolored_by_the_number_of_the_step():
     pairs = toy(5, side=8, kind="color")
     options = dataclasses.replace(SMALL, turns=False)
-    plain = training.make_batches(pairs, options)(3)[0]
-    make = training.make_batches(pairs, dataclasses.replace(options, mixes=False), "color")
+    plain = feed.make_batches(pairs, options)(3)[0]
+    make = feed.make_batches(pairs, dataclasses.replace(options, mixes=False), "color")
     first, again, other = make(3)[0], make(3)[0], make(8)[0]
     np.testing.assert_array_equal(first.target, again.target)
     assert np.abs(first.target - plain.target).max() > 0.01
@@ -86,7 +87,7 @@ def test_pairs_are_turned_in_eight_ways_all_maps_alike():
     pairs = toy(2, side=8)
     seen = set()
     for which in range(8):
-        found = training.turned(pairs.batch, which)
+        found = feed.turned(pairs.batch, which)
         # The target stays where its inputs are: paint was added to the background.
         inside = np.asarray(found.mask)[..., 0] == 0.0
         np.testing.assert_array_equal(
@@ -97,7 +98,7 @@ def test_pairs_are_turned_in_eight_ways_all_maps_alike():
         assert np.asarray(found.inputs).sum() == pytest.approx(pairs.batch.inputs.sum(), rel=1e-5)
         seen.add(np.asarray(found.inputs).tobytes())
     assert len(seen) == 8
-    batches = training.make_batches(pairs, dataclasses.replace(SMALL, batch=1))
+    batches = feed.make_batches(pairs, dataclasses.replace(SMALL, batch=1))
     first, again = batches(3)[0], batches(3)[0]
     np.testing.assert_array_equal(first.inputs, again.inputs)
 
@@ -128,6 +129,29 @@ def test_color_errors_tell_false_colors():
     assert false["delta_e"] > 20.0 and false["out_of_hull"] > 0.9
     columns, rows = evaluation.table("color", {"x": same, "y": false})
     assert all(len(row) == len(columns) for row in rows)
+
+
+def test_a_single_network_is_judged_in_its_two_parts():
+    pairs = toy(2, side=16, kind="single")
+    truth = np.asarray(pairs.batch.target)
+    wrong = truth + np.array([0.0, 0.0, 0.0, 0.2], np.float32)
+    parts = evaluation.parts("single", wrong, pairs)
+    found = {name: evaluation.compare(name, *part, SCALE) for name, part in parts.items()}
+    assert found["color"]["the network"]["rmse_whole"] == 0.0
+    assert found["height"]["the network"]["rmse_whole"] == pytest.approx(0.2, rel=1e-5)
+    alone = evaluation.compare("height", truth[..., 3:], toy(2, side=16), SCALE)
+    assert found["height"]["copy the background"] == alone["copy the background"]
+    assert evaluation.parts("height", truth, pairs) == {"height": (truth, pairs)}
+
+
+@pytest.mark.slow
+def test_a_single_network_learns_color_and_height(tmp_path):
+    options = dataclasses.replace(SMALL, out=tmp_path, mixes=False, recolor=False)
+    found = training.fit(options, "single", *(toy(4, 16, s, "single") for s in range(3)), SCALE)
+    assert set(found["errors"]) == {"color", "height"}
+    exported = checkpoint.load(tmp_path / "single.npz")
+    assert exported.config.outputs == 4
+    assert set(exported.card["errors of the preview stroke"]) == {"color", "height"}
 
 
 def test_log_goes_on_from_a_checkpoint(tmp_path):
@@ -220,10 +244,11 @@ def test_killed_run_resumes_to_the_same_bits(tmp_path, monkeypatch):
 @pytest.mark.slow
 def test_non_finite_step_stops_and_names_what_to_look_at(tmp_path):
     train, held = toy(6, side=16), toy(2, side=16, seed=1)
-    order = [int(training.indices(0, step, 1, 6)[0]) for step in range(6)]
+    order = [int(feed.indices(0, step, 1, 6)[0]) for step in range(6)]
     target = np.array(train.batch.target)
     target[order[3]] = np.nan
-    broken = Pairs(dataclasses.replace(train.batch, target=jnp.asarray(target)), train.preview)
+    batch = dataclasses.replace(train.batch, target=jnp.asarray(target))
+    broken = dataclasses.replace(train, batch=batch)
     options = dataclasses.replace(SMALL, steps=6)
     with pytest.raises(training.NotFinite, match=rf"step 3 .* pairs \[{order[3]}\].*checkpoints/2"):
         training.run(options, "height", broken, held, tmp_path)
