@@ -26,6 +26,7 @@ from experiments.common import (
     COLORS,
     INK,
     console,
+    helped,
     print_table,
     results_folder,
     save_figure,
@@ -238,4 +239,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -39,6 +39,7 @@ from experiments.common import (
     INK,
     Timing,
     console,
+    helped,
     print_table,
     results_folder,
     save_figure,
@@ -378,4 +379,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import json
 import os
+import re
 import sys
 import time
 from pathlib import Path
@@ -51,6 +52,11 @@ matplotlib.rcParams.update(
         "ytick.labelcolor": INK,
     }
 )
+
+
+def helped(text: str) -> str:
+    """A module's docstring as `--help` shows it, which joins lines: every command on its own."""
+    return re.sub(r"\n+python -m", "\n\npython -m", text)
 
 
 def results_folder(name: str, out: Path | None) -> Path:

@@ -21,6 +21,7 @@ from experiments.common import (
     COLORS,
     INK,
     console,
+    helped,
     label_points,
     print_table,
     results_folder,
@@ -268,4 +269,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

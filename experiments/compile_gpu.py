@@ -30,7 +30,7 @@ from jax.experimental import topologies
 from jax.sharding import SingleDeviceSharding
 from rich.progress import track
 
-from experiments.common import print_table, results_folder, write_run
+from experiments.common import helped, print_table, results_folder, write_run
 from jaxbrush import data, pairs
 from jaxbrush.brush import BrushConfig, make_brush, rollout
 from jaxbrush.models import DiscriminatorConfig, GeneratorConfig
@@ -201,4 +201,4 @@ def main(options: Config) -> list[dict]:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -16,7 +16,7 @@ import numpy as np
 import tyro
 
 from experiments import evaluation, make_dataset, train_network, training
-from experiments.common import print_table, results_folder, write_run
+from experiments.common import helped, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import batches, checkpoint, data
 from jaxbrush.models import Generator, inputs_of
@@ -110,4 +110,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -23,7 +23,7 @@ import optax
 import tyro
 from rich.progress import Progress
 
-from experiments.common import console, results_folder, write_run
+from experiments.common import console, helped, results_folder, write_run
 from experiments.fit_drawing import Show, chart, film, report, strip
 from experiments.fit_loss import PIXEL, Level, compare, target_of, unlike_exact
 from experiments.fit_opening import SMOOTH, basis, moved
@@ -412,4 +412,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -21,7 +21,7 @@ import numpy as np
 import tyro
 from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
 
-from experiments.common import console, print_table
+from experiments.common import console, helped, print_table
 from jaxbrush import batches, data
 from jaxbrush.canvas import Canvas, from_srgb
 from jaxbrush.render import picture, shade
@@ -215,4 +215,4 @@ if __name__ == "__main__":
         target, name, number, which = sys.argv[2:6]
         work(Path(target), name, int(number), [int(n) for n in which.split(",")])
     else:
-        main(tyro.cli(Config, description=__doc__))
+        main(tyro.cli(Config, description=helped(__doc__)))

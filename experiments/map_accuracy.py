@@ -26,7 +26,7 @@ from rich.progress import Progress
 
 from experiments import common, map_cases
 from experiments.brush_costs import peak_flops, stream_bytes
-from experiments.common import COLORS, INK, Timing, console, print_table
+from experiments.common import COLORS, INK, Timing, console, helped, print_table
 from experiments.map_cases import SIDE, between, draw, finer, roll
 from jaxbrush.brush import BrushConfig, guides, make_brush, rollout
 from jaxbrush.raster import FORCE_UNIT, PIXEL, WIDTH, TrajectoryMaps, exact, trajectory_maps
@@ -404,4 +404,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

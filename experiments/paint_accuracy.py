@@ -23,7 +23,7 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from rich.progress import Progress
 
 from experiments import common
-from experiments.common import COLORS, INK, console, print_table
+from experiments.common import COLORS, INK, console, helped, print_table
 from experiments.paint_cases import (
     BRISTLES,
     DEEP,
@@ -311,4 +311,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -18,7 +18,7 @@ from PIL import Image
 from rich.progress import track
 
 from experiments import engines, paint_scenes
-from experiments.common import console, print_table, results_folder, write_run
+from experiments.common import console, helped, print_table, results_folder, write_run
 from jaxbrush import recordings
 from jaxbrush.batches import LEVELS
 from jaxbrush.canvas import Canvas, to_srgb
@@ -136,4 +136,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

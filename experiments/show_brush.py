@@ -18,7 +18,7 @@ from PIL import Image
 from rich.progress import track
 
 from experiments.brush_drawing import PAPER, View, draw_hair, draw_handle, draw_track
-from experiments.common import INK, console, print_table, results_folder, timed, write_run
+from experiments.common import INK, console, helped, print_table, results_folder, timed, write_run
 from jaxbrush.brush import SHAPES, BrushConfig, make_brush, rollout
 from jaxbrush.brush.handle import poses, turned
 from jaxbrush.stylus import make_stroke
@@ -270,4 +270,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

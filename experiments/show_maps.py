@@ -22,6 +22,7 @@ from experiments.common import (
     FAINT,
     INK,
     console,
+    helped,
     print_table,
     results_folder,
     timed,
@@ -292,4 +293,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

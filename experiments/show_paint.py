@@ -18,7 +18,7 @@ import numpy as np
 import tyro
 from rich.progress import track
 
-from experiments.common import console, print_table, results_folder, write_run
+from experiments.common import console, helped, print_table, results_folder, write_run
 from experiments.paint_scenes import BRISTLES, NAMES, PALETTE, SCENES, brush_of, hand
 from jaxbrush.brush import BrushConfig, rollout
 from jaxbrush.canvas import flatten
@@ -132,4 +132,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

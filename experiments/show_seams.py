@@ -16,7 +16,7 @@ import tyro
 from rich.progress import track
 
 from experiments import engines, paint_scenes, paint_session
-from experiments.common import console, print_table, results_folder, save_figure, write_run
+from experiments.common import console, helped, print_table, results_folder, save_figure, write_run
 from jaxbrush import painter, patches, seams, stages
 from jaxbrush.canvas import blank
 from jaxbrush.recordings import BrushEvent
@@ -147,4 +147,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

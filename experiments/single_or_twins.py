@@ -20,6 +20,7 @@ import tyro
 from experiments import ablations, evaluate, evaluation, make_dataset, train_network
 from experiments.common import (
     COLORS,
+    helped,
     label_points,
     print_table,
     results_folder,
@@ -177,4 +178,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

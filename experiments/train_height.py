@@ -8,6 +8,7 @@ python -m experiments.train_height --resume --minutes 30
 import tyro
 
 from experiments import train_network
+from experiments.common import helped
 from experiments.train_network import Config
 
 
@@ -16,4 +17,4 @@ def main(options: Config) -> None:
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))

@@ -20,7 +20,15 @@ import numpy as np
 import tyro
 
 from experiments import train_torch
-from experiments.common import COLORS, console, print_table, results_folder, save_figure, write_run
+from experiments.common import (
+    COLORS,
+    console,
+    helped,
+    print_table,
+    results_folder,
+    save_figure,
+    write_run,
+)
 from jaxbrush.models import DiscriminatorConfig, GeneratorConfig
 from jaxbrush.train import Batch, TrainConfig, make_train
 
@@ -219,4 +227,4 @@ def main(options: Config):
 
 
 if __name__ == "__main__":
-    main(tyro.cli(Config, description=__doc__))
+    main(tyro.cli(Config, description=helped(__doc__)))
