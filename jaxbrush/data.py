@@ -21,7 +21,7 @@ from jaxbrush.paint import PaintConfig
 from jaxbrush.pairs import PairConfig, Picture, canvas_pairs, canvases_pairs
 from jaxbrush.structs import config
 
-FORMAT = 7
+FORMAT = 8
 FULL = 65535
 CHANNELS = (
     ("height", 1), ("color", 3), ("pressure", 1), ("sweeps", 1), ("trajectory", 3), ("time", 1),
@@ -64,10 +64,16 @@ PRESETS = {
     "tiny": DataConfig(PairConfig(), train=40, test=10, shard=2),
     "cpu": DataConfig(PairConfig(), train=500, test=28, shard=2),
     "small": DataConfig(
-        PairConfig(size=256, strokes=5, stamps=576, bristles=256), train=200, test=25, shard=5
+        PairConfig(size=256, strokes=5, stamps=768, way=34.0, bristles=256),
+        train=200,
+        test=25,
+        shard=5,
     ),
     "paper": DataConfig(
-        PairConfig(size=512, strokes=5, stamps=1024, bristles=256), train=2000, test=200, shard=5
+        PairConfig(size=512, strokes=5, stamps=1408, way=61.0, bristles=256),
+        train=2000,
+        test=200,
+        shard=5,
     ),
 }
 """tiny: 160 + 40 pairs of 128 x 128. cpu: 2,000 + 112 such, what two cores make in an hour. small:

@@ -45,21 +45,25 @@ REACH = 8
 
 @config
 class PairConfig:
-    """size: of the canvas, square [pixels]. strokes: painted on each canvas, one pair each. stamps:
-    of a stroke at most; longer ones are made smaller. spacing: of the stamps that are painted
-    [mm], a pixel or a whole part of it; maps are drawn a pixel apart, as in use. bristles:
-    simulated. paint, brush: the simulators."""
+    """size: of the canvas, square [pixels]. strokes: painted on each canvas, one pair each.
+    hatched: every so many-th canvas is painted side by side (`draw_beside`), 0 is none. stamps: of
+    a stroke at most; longer ones are made smaller. way: of strokes that are not side by side, at
+    most, also so [mm]. spacing: of the stamps that are painted [mm], a pixel or a whole part of
+    it; maps are drawn a pixel apart, as in use. bristles: simulated. paint, brush: the
+    simulators."""
 
     size: int = 128
     strokes: int = 4
-    stamps: int = 320
+    hatched: int = 3
+    stamps: int = 448
+    way: float = 19.0
     spacing: float = 0.0625
     bristles: int = 128
     paint: PaintConfig = PaintConfig(window=48)  # noqa: RUF009
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
 
     def __post_init__(self):
-        for name, least in (("strokes", 1), ("stamps", 8), ("bristles", 1)):
+        for name, least in (("strokes", 1), ("hatched", 0), ("stamps", 8), ("bristles", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"PairConfig.{name} = {getattr(self, name)}: expected >= {least}")
         if not self.spacing > 0.0 or abs(self.every * self.spacing - self.paint.pixel) > 1e-9:
@@ -67,6 +71,8 @@ class PairConfig:
                 f"PairConfig.spacing = {self.spacing}: expected the pixel, {self.paint.pixel} mm, "
                 "or a whole part of it"
             )
+        if not self.way > 0.0:
+            raise ValueError(f"PairConfig.way = {self.way}: expected > 0 mm")
         if self.size < self.paint.window or self.size % 4:
             raise ValueError(
                 f"PairConfig.size = {self.size}: expected a multiple of 4, at least the window, "
@@ -131,20 +137,16 @@ def draw_palette(key, pigments: int):
     return from_srgb(value[:, None] * (1.0 - chroma[:, None] * (1.0 - jnp.clip(wheel, 0.0, 1.0))))
 
 
-def _draw_stroke(options: PairConfig, key, depth):
-    """A stroke that fits the canvas and the stamps, turned at random; it may leave the canvas."""
-    own, turn, shift = jax.random.split(key, 3)
-    side = options.size * options.paint.pixel
-    stroke = random_stroke(own, 128, 0.8 * side)
-    # The way of the handle, lifting included, must not ask for more stamps than there are.
+def _placed(options: PairConfig, stroke: Stroke, depth, most, place, rotate):
+    """The stroke as stamps, its middle at `place` (2,) [mm], turned; smaller where its way, lifting
+    included, is longer than `most` [mm] or than there are stamps."""
     way = jnp.sum(jnp.sqrt(jnp.sum(jnp.diff(stroke.position, axis=0) ** 2, axis=1) + 1e-12))
     lift = depth * jnp.sum(jnp.abs(jnp.diff(stroke.pressure)))
-    room = jnp.maximum(0.95 * options.stamps * options.spacing - lift, 1.0)
+    room = jnp.maximum(min(most, 0.95 * options.stamps * options.spacing) - lift, 1.0)
     middle = 0.5 * (stroke.position.max(0) + stroke.position.min(0))
-    place = jax.random.uniform(shift, (2,), minval=0.25 * side, maxval=0.75 * side)
     stroke = transform(
         stroke,
-        rotate=jax.random.uniform(turn, (), maxval=2.0 * np.pi),
+        rotate=rotate,
         translate=place - middle,
         scale=jnp.minimum(1.0, room / way),
         center=middle,
@@ -152,9 +154,19 @@ def _draw_stroke(options: PairConfig, key, depth):
     return resample(stroke, options.stamps, options.spacing, np.inf, depth)
 
 
-def draw(options: PairConfig, key) -> Plan:
-    """Draws one stroke: brush, hand, load and color."""
-    shape, size, hair, hand, color, load = jax.random.split(key, 6)
+def _draw_stroke(options: PairConfig, key, depth):
+    """A stroke that fits the canvas, turned at random; it may leave the canvas."""
+    own, turn, shift = jax.random.split(key, 3)
+    side = options.size * options.paint.pixel
+    place = jax.random.uniform(shift, (2,), minval=0.25 * side, maxval=0.75 * side)
+    rotate = jax.random.uniform(turn, (), maxval=2.0 * np.pi)
+    stroke = random_stroke(own, 128, 0.8 * side)
+    return _placed(options, stroke, depth, options.way, place, rotate)
+
+
+def _draw_brush(options: PairConfig, key):
+    """The brush of `draw`: its params, those of its paint, and its width [mm]."""
+    shape, size, hair, *_ = jax.random.split(key, 6)
     name = SHAPES[int(jax.random.randint(shape, (), 0, len(SHAPES)))]
     low, high = (1.4, 2.8) if name == "round" else (1.8, 4.0)
     width = jax.random.uniform(size, (), minval=low, maxval=high)
@@ -165,7 +177,13 @@ def draw(options: PairConfig, key) -> Plan:
         length=length, press_depth=0.25 * length,
     )  # fmt: skip
     disc = name == "round"
-    paint = for_brush(make_params(), width, thickness, options.bristles, disc)
+    return brush, for_brush(make_params(), width, thickness, options.bristles, disc), width
+
+
+def draw(options: PairConfig, key) -> Plan:
+    """Draws one stroke: brush, hand, load and color."""
+    *_, hand, color, load = jax.random.split(key, 6)
+    brush, paint, _ = _draw_brush(options, key)
     first, second, blend = jax.random.split(color, 3)
     pick = lambda k: jax.nn.one_hot(  # noqa: E731
         jax.random.randint(k, (), 0, options.paint.pigments), options.paint.pigments
@@ -173,13 +191,52 @@ def draw(options: PairConfig, key) -> Plan:
     # Every third stroke is mixed from two.
     share = jnp.maximum(0.0, jax.random.uniform(blend, (), minval=-1.0, maxval=0.5))
     return Plan(
-        stroke=_draw_stroke(options, hand, 0.25 * length),
+        stroke=_draw_stroke(options, hand, brush.press_depth),
         brush=brush,
         paint=paint,
         mix=(1.0 - share) * pick(first) + share * pick(second),
         # Mostly full, some nearly dry.
         load=1.0 - 0.75 * jax.random.uniform(load, ()) ** 2,
     )
+
+
+def draw_beside(options: PairConfig, key, number: int) -> Plan:
+    """Draws stroke `number` of a canvas that is painted as an area is: with one brush, in strokes
+    side by side that overlap, some to and fro, and longer than those of `draw`, so that they cross
+    the canvas. Load, color and pressure are each stroke's own.
+
+    Strokes at random hardly ever go along the edge of another. Networks that saw those alone left a
+    band of the old color there, wider after more training.
+
+    Args:
+      key: of the canvas, from which `draw` has `fold_in(key, number + 1)` for this stroke.
+    """
+    own = jax.random.fold_in(key, number + 1)
+    brush, paint, width = _draw_brush(options, jax.random.fold_in(key, 1))
+    path, layout = jax.random.split(jax.random.fold_in(key, options.strokes + 1))
+    choice, gap, to_and_fro, *place = jax.random.uniform(layout, (5,))
+    along, aside = jax.random.uniform(jax.random.fold_in(own, 0), (2,), minval=-0.1, maxval=0.1)
+    side = options.size * options.paint.pixel
+    # Straight, or an arc, or an S.
+    kind = jnp.searchsorted(jnp.asarray([0.6, 0.9], choice.dtype), choice)
+    stroke = random_stroke(path, 128, 1.6 * side, kind)
+    hand = random_stroke(jax.random.fold_in(own, 1), 128, 1.6 * side, kind)
+    chord = stroke.position[-1] - stroke.position[0]
+    chord = chord / jnp.sqrt(jnp.sum(chord * chord) + 1e-12)
+    normal = jnp.stack([-chord[1], chord[0]])
+    # Three to nine tenths of the brush's width between neighbours.
+    away = (number - 0.5 * (options.strokes - 1)) * (0.3 + 0.6 * gap) + aside
+    middle = side * (0.35 + 0.3 * jnp.stack(place)) + width * away * normal + side * along * chord
+    back = (to_and_fro > 0.5) & (number % 2 == 1)
+    stroke = dataclasses.replace(
+        stroke,
+        position=jnp.where(back, stroke.position[::-1], stroke.position),
+        pressure=hand.pressure,
+        # Its broad side ahead, more or less.
+        twist=jnp.arctan2(chord[1], chord[0]) + 0.5 * np.pi + 0.4 * stroke.twist,
+    )
+    stroke = _placed(options, stroke, brush.press_depth, np.inf, middle, 0.0)
+    return dataclasses.replace(draw(options, own), stroke=stroke, brush=brush, paint=paint)
 
 
 @state
@@ -294,9 +351,15 @@ _paint_pairs = jax.jit(jax.vmap(paint_pair, in_axes=(None, 0, 0, 0, None)))
 
 
 def _begun(options: PairConfig, seed: int, number: int):
-    """Key and palette of a canvas."""
+    """Palette of a canvas, and `plan(stroke)` of its strokes."""
     key = jax.random.fold_in(jax.random.key(seed), number)
-    return key, draw_palette(jax.random.fold_in(key, 0), options.paint.pigments)
+
+    def plan(stroke: int) -> Plan:
+        if options.hatched and number % options.hatched == options.hatched - 1:
+            return draw_beside(options, key, stroke)
+        return draw(options, jax.random.fold_in(key, stroke + 1))
+
+    return draw_palette(jax.random.fold_in(key, 0), options.paint.pigments), plan
 
 
 def canvas_pairs(options: PairConfig, seed: int, number: int):
@@ -308,13 +371,12 @@ def canvas_pairs(options: PairConfig, seed: int, number: int):
     Returns:
       list of `strokes` Pictures, numpy arrays.
     """
-    key, palette = _begun(options, seed, number)
+    palette, plan = _begun(options, seed, number)
     shape = (options.size + 2 * MARGIN,) * 2
     tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
     canvas, pictures = empty_canvas(options.paint, shape), []
     for stroke in range(options.strokes):
-        plan = draw(options, jax.random.fold_in(key, stroke + 1))
-        canvas, picture = _paint_pair(options, plan, palette, canvas, tooth)
+        canvas, picture = _paint_pair(options, plan(stroke), palette, canvas, tooth)
         pictures.append(jax.tree.map(np.asarray, picture))
     return pictures
 
@@ -322,14 +384,14 @@ def canvas_pairs(options: PairConfig, seed: int, number: int):
 def canvases_pairs(options: PairConfig, seed: int, numbers):
     """`canvas_pairs` of several canvases, a list for each, painted side by side: for a GPU, which
     one canvas does not fill. The same but for rounding, which moves single grooves."""
-    keys, palettes = zip(*(_begun(options, seed, n) for n in numbers), strict=True)
+    palettes, plans = zip(*(_begun(options, seed, n) for n in numbers), strict=True)
     shape = (options.size + 2 * MARGIN,) * 2
     tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
     stacked = lambda trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)  # noqa: E731
-    canvas, palette = stacked([empty_canvas(options.paint, shape)] * len(keys)), stacked(palettes)
+    canvas, palette = stacked([empty_canvas(options.paint, shape)] * len(plans)), stacked(palettes)
     strokes = []
     for stroke in range(options.strokes):
-        plans = stacked([draw(options, jax.random.fold_in(key, stroke + 1)) for key in keys])
-        canvas, picture = _paint_pairs(options, plans, palette, canvas, tooth)
+        drawn = stacked([plan(stroke) for plan in plans])
+        canvas, picture = _paint_pairs(options, drawn, palette, canvas, tooth)
         strokes.append(jax.device_get(picture))
-    return [[jax.tree.map(lambda x, k=k: x[k], p) for p in strokes] for k in range(len(keys))]
+    return [[jax.tree.map(lambda x, k=k: x[k], p) for p in strokes] for k in range(len(plans))]

@@ -235,6 +235,45 @@ def test_long_strokes_fit_their_stamps():
         assert np.isclose(float(plan.mix.sum()), 1.0) and 0.0 < float(plan.load) <= 1.0
 
 
+def test_some_canvases_are_painted_side_by_side():
+    """Strokes at random hardly ever run along the edge of another; a painter's do."""
+    options = pairs.PairConfig()
+
+    def paths(options, number):
+        _, plan = pairs._begun(options, 0, number)
+        plans = [plan(k) for k in range(options.strokes)]
+        ends = []
+        for p in plans:
+            known = np.asarray(p.stroke.position)[np.asarray(p.stroke.valid)]
+            assert np.hypot(*np.diff(known, axis=0).T).max() <= options.spacing * 1.01
+            ends.append(known[[0, -1]])
+        return plans, np.stack(ends), [np.asarray(p.stroke.pressure).max() for p in plans]
+
+    def apart(ends):
+        """Angles between neighbours as undirected lines, and how far aside their middles lie."""
+        chord = ends[:, 1] - ends[:, 0]
+        chord /= np.linalg.norm(chord, axis=1, keepdims=True)
+        step = np.diff(ends.mean(1), axis=0)
+        aside = np.abs(step[:, 1] * chord[:-1, 0] - step[:, 0] * chord[:-1, 1])
+        return np.degrees(np.arccos(np.abs(np.sum(chord[1:] * chord[:-1], 1)).clip(0, 1))), aside
+
+    for number in (2, 5, 8):
+        plans, ends, press = paths(options, number)
+        angles, aside = apart(ends)
+        width = (4.0 * float(plans[0].brush.press_depth) - 6.0) / 3.0
+        assert angles.max() < 10.0 and len(set(press)) == options.strokes
+        assert 0.0 < aside.min() and aside.max() < 1.3 * width
+        for p in plans[1:]:
+            jax.tree.map(np.testing.assert_array_equal, p.brush, plans[0].brush)
+        # At random they would not be like that, and others are as without.
+        alone, ends, _ = paths(dataclasses.replace(options, hatched=0), number)
+        assert apart(ends)[0].max() > 20.0
+        np.testing.assert_array_equal(alone[1].mix, plans[1].mix)
+    none = dataclasses.replace(options, hatched=0)
+    for mine, its in zip(paths(options, 3)[0], paths(none, 3)[0], strict=True):
+        jax.tree.map(np.testing.assert_array_equal, mine, its)
+
+
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
     for kind, outputs, channels in (("height", 1, HEIGHT_INPUTS), ("color", 3, 15)):
