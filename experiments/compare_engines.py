@@ -3,7 +3,6 @@ Table 1), and white painted over white (Figure 14).
 
 python -m experiments.compare_engines
 python -m experiments.compare_engines --quick            # eight strokes
-python -m experiments.compare_engines --fast checkpoints/fast_height.npz checkpoints/fast_color.npz
 """
 
 import dataclasses
@@ -53,8 +52,8 @@ class Config:
     """So many strokes: the first ones, or more than there are, painted again over themselves."""
     weights: tuple[Path, Path] = engines.SHIPPED
     """Height and color network."""
-    fast: tuple[Path, Path] | None = None
-    """A second pair of networks."""
+    fast: tuple[Path, Path] | None = engines.FAST
+    """A second pair of networks, of half the width."""
     whites: int = WHITES
     """Strokes of white over white."""
     out: Path | None = None

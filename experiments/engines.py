@@ -277,6 +277,8 @@ def preview_times(options: painter.PainterConfig, nets: painter.Nets, shape, dee
 
 
 SHIPPED = (Path("checkpoints/height.npz"), Path("checkpoints/color.npz"))
+FAST = (Path("checkpoints/fast_height.npz"), Path("checkpoints/fast_color.npz"))
+"""Networks of half the width of `SHIPPED`."""
 TAUGHT = data.PRESETS["cpu"].pairs
 """The simulator as the networks were taught by it."""
 
