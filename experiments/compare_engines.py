@@ -197,6 +197,7 @@ def main(options: Config) -> None:
         deeds = engines.deeds_of(session, shape)
         if deeds and options.strokes is not None:
             deeds = [deeds[n % len(deeds)] for n in range(options.strokes)]
+        deeds = engines.mixable(deeds)
         made = makers(options, shape, deeds)
     except (ValueError, OSError) as error:
         raise SystemExit(f"{error}") from error

@@ -17,7 +17,7 @@ from scipy.optimize import nnls
 
 from jaxbrush import data, painter
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
-from jaxbrush.canvas import Canvas, absorbed, blank, flatten
+from jaxbrush.canvas import Canvas, absorbed, blank, flatten, reflected
 from jaxbrush.paint import (
     PaintConfig,
     PaintParams,
@@ -124,6 +124,18 @@ def palette_of(deeds, most: int = 6) -> np.ndarray:
         away = np.min(np.linalg.norm(place[:, None] - place[None, chosen], axis=-1), axis=1)
         chosen.append(int(np.argmax(away)))
     return colors[chosen]
+
+
+def mixable(deeds) -> list[Deed]:
+    """The deeds in colors that the palette of all of them mixes, the nearest to their own: else the
+    simulator paints in other colors than the networks (the sea's farthest by a ΔE of 9.9)."""
+    palette = palette_of(deeds)
+
+    def mixed(rgb):
+        mean = shares(rgb, palette) @ _absorbed(palette)
+        return tuple(float(x) for x in reflected(jnp.asarray(mean)))
+
+    return [dataclasses.replace(deed, color=mixed(deed.color)) for deed in deeds]
 
 
 def _clock(stages: dict, name: str, call):

@@ -40,6 +40,23 @@ def test_the_picture_that_comes_along_is_a_session_and_fills_its_canvas():
     assert {d.load for d in deeds} == {d for d in np.asarray([t.load for t in paint_scenes._sea()])}
 
 
+def test_engines_are_compared_in_colors_that_the_palette_mixes():
+    deeds = engines.deeds_of(paint_scenes.recorded("sea"), (132, 176))
+    palette = engines.palette_of(deeds)
+
+    def apart(deeds):
+        """From what the simulator's pigments give for the colors of the deeds."""
+        given = [
+            mix_subtractive(engines.shares(d.color, palette).astype(np.float32), palette)
+            for d in deeds
+        ]
+        return np.abs(np.asarray(given) - np.asarray([d.color for d in deeds])).max()
+
+    mixable = engines.mixable(deeds)
+    assert apart(mixable) < 2e-3 < 0.02 < apart(deeds)
+    np.testing.assert_allclose(engines.palette_of(mixable), palette, atol=1e-5)
+
+
 def test_a_session_without_brush_and_color_is_painted_all_the_same():
     stroke = recordings.StrokeEvent((0.0, 1.0), (1.0, 5.0), (1.0, 2.0), (0.5, 0.5))
     session = recordings.Session((8.0, 8.0), 1.0, (stroke,) * 3)
