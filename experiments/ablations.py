@@ -27,6 +27,7 @@ from experiments.common import (
     INK,
     console,
     helped,
+    label_points,
     print_table,
     results_folder,
     save_figure,
@@ -195,11 +196,11 @@ def chart(kind: str, rows: list[dict], path: Path):
     noise = [r["masked"] for r in rows if r["name"] in ("default", "another seed")]
     if len(noise) == 2:
         axis.axhspan(min(noise), max(noise), color=COLORS[0], alpha=0.15, lw=0)
+    labels = []
     for row in rows:
         own = row["name"] == "default"
         axis.plot(row["ms"], row["masked"], "o", ms=8 if own else 5, color=COLORS[0 if own else 1])
-        axis.annotate(row["name"], (row["ms"], row["masked"]), xytext=(6, 0), color=INK,
-                      textcoords="offset points", va="center", fontsize=8)  # fmt: skip
+        labels.append((row["name"], (row["ms"], row["masked"]), {"fontsize": 8, "color": INK}))
     axis.set_xscale("log")
     axis.margins(x=0.3)
     axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
@@ -208,6 +209,7 @@ def chart(kind: str, rows: list[dict], path: Path):
     axis.set_xlabel(f"time to paint {SIDE} x {SIDE} pixels [ms]")
     axis.set_ylabel("RMSE in the mask, network scale")
     axis.set_title(f"{kind}: what each part is worth; the band is another seed")
+    label_points(axis, labels)
     save_figure(figure, path)
 
 

@@ -40,14 +40,18 @@ RECOLOR = 0.7
 """Largest change of the logarithm of absorption over scattering, in each channel."""
 
 
-def _every(pairs: Pairs):
-    """All pairs on the host, some at a time: what they are made from is as large again."""
+SOME = 64
+"""Pairs that are made at once."""
+
+
+def every(pairs: Pairs):
+    """All pairs on the host, `SOME` at a time: what they are made from is as large again."""
     count = len(pairs)
     whole = jax.tree.map(
         lambda x: np.empty((count, *x.shape[1:]), x.dtype), pairs.take(np.arange(1))
     )
-    for first in range(0, count, 64):
-        index = np.arange(first, min(first + 64, count))
+    for first in range(0, count, SOME):
+        index = np.arange(first, min(first + SOME, count))
         for into, some in zip(*map(jax.tree.leaves, (whole, pairs.take(index))), strict=True):
             into[index] = some
     return whole
@@ -58,7 +62,7 @@ def make_batches(pairs: Pairs, options, kind: str = "height"):
     the same whether all pairs are on the device or not."""
     device = jax.devices()[0]
     resident = pairs.nbytes <= options.resident * 1e9
-    data = jax.device_put(_every(pairs), device) if resident else None
+    data = jax.device_put(every(pairs), device) if resident else None
     gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
     # The paint knows no direction, so every pair is worth eight.
     turn = jax.jit(turned)

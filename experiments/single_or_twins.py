@@ -4,7 +4,7 @@ All are trained from nothing on the same pairs for the same number of updates. T
 they are used: the color network is given the height that its twin predicts. The wide single network
 takes about as long to paint as both twins. Networks that are trained are not trained again.
 
-python -m experiments.single_or_twins                    # five networks, some minutes each
+python -m experiments.single_or_twins                    # six networks, some minutes each
 python -m experiments.single_or_twins --preset cpu --steps 2000
 """
 
@@ -112,6 +112,7 @@ def sheet(columns: dict[str, np.ndarray], path: Path):
 
 def chart(rows: list[dict], path: Path):
     figure, axes = plt.subplots(1, 2, figsize=(9.6, 4.2))
+    figure.suptitle("One network or two, trained alike; painted: colors, not shares of paints")
     measures = {
         "height": "height: RMSE in the mask, network scale",
         "delta_e": "color: ΔE (CIEDE2000)",

@@ -46,7 +46,7 @@ REACH = 8
 @config
 class PairConfig:
     """size: of the canvas, square [pixels]. strokes: painted on each canvas, one pair each.
-    hatched: every so many-th canvas is painted side by side (`draw_beside`), 0 is none. stamps: of
+    beside: every so many-th canvas is painted side by side (`draw_beside`), 0 is none. stamps: of
     a stroke at most; longer ones are made smaller. way: of strokes that are not side by side, at
     most, also so [mm]. spacing: of the stamps that are painted [mm], a pixel or a whole part of
     it; maps are drawn a pixel apart, as in use. bristles: simulated. paint, brush: the
@@ -54,7 +54,7 @@ class PairConfig:
 
     size: int = 128
     strokes: int = 4
-    hatched: int = 3
+    beside: int = 3
     stamps: int = 448
     way: float = 19.0
     spacing: float = 0.0625
@@ -63,7 +63,7 @@ class PairConfig:
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
 
     def __post_init__(self):
-        for name, least in (("strokes", 1), ("hatched", 0), ("stamps", 8), ("bristles", 1)):
+        for name, least in (("strokes", 1), ("beside", 0), ("stamps", 8), ("bristles", 1)):
             if getattr(self, name) < least:
                 raise ValueError(f"PairConfig.{name} = {getattr(self, name)}: expected >= {least}")
         if not self.spacing > 0.0 or abs(self.every * self.spacing - self.paint.pixel) > 1e-9:
@@ -180,24 +180,29 @@ def _draw_brush(options: PairConfig, key):
     return brush, for_brush(make_params(), width, thickness, options.bristles, disc), width
 
 
-def draw(options: PairConfig, key) -> Plan:
-    """Draws one stroke: brush, hand, load and color."""
-    *_, hand, color, load = jax.random.split(key, 6)
-    brush, paint, _ = _draw_brush(options, key)
+def _draw_load(options: PairConfig, key):
+    """The mix and the load of `draw`, as `Plan` has them."""
+    *_, color, load = jax.random.split(key, 6)
     first, second, blend = jax.random.split(color, 3)
     pick = lambda k: jax.nn.one_hot(  # noqa: E731
         jax.random.randint(k, (), 0, options.paint.pigments), options.paint.pigments
     )
     # Every third stroke is mixed from two.
     share = jnp.maximum(0.0, jax.random.uniform(blend, (), minval=-1.0, maxval=0.5))
-    return Plan(
-        stroke=_draw_stroke(options, hand, brush.press_depth),
-        brush=brush,
-        paint=paint,
-        mix=(1.0 - share) * pick(first) + share * pick(second),
-        # Mostly full, some nearly dry.
-        load=1.0 - 0.75 * jax.random.uniform(load, ()) ** 2,
+    # Mostly full, some nearly dry.
+    return (
+        (1.0 - share) * pick(first) + share * pick(second),
+        1.0 - 0.75 * jax.random.uniform(load, ()) ** 2,
     )
+
+
+def draw(options: PairConfig, key) -> Plan:
+    """Draws one stroke: brush, hand, load and color."""
+    hand = jax.random.split(key, 6)[3]
+    brush, paint, _ = _draw_brush(options, key)
+    mix, load = _draw_load(options, key)
+    stroke = _draw_stroke(options, hand, brush.press_depth)
+    return Plan(stroke=stroke, brush=brush, paint=paint, mix=mix, load=load)
 
 
 def draw_beside(options: PairConfig, key, number: int) -> Plan:
@@ -236,7 +241,8 @@ def draw_beside(options: PairConfig, key, number: int) -> Plan:
         twist=jnp.arctan2(chord[1], chord[0]) + 0.5 * np.pi + 0.4 * stroke.twist,
     )
     stroke = _placed(options, stroke, brush.press_depth, np.inf, middle, 0.0)
-    return dataclasses.replace(draw(options, own), stroke=stroke, brush=brush, paint=paint)
+    mix, load = _draw_load(options, own)
+    return Plan(stroke=stroke, brush=brush, paint=paint, mix=mix, load=load)
 
 
 @state
@@ -355,7 +361,7 @@ def _begun(options: PairConfig, seed: int, number: int):
     key = jax.random.fold_in(jax.random.key(seed), number)
 
     def plan(stroke: int) -> Plan:
-        if options.hatched and number % options.hatched == options.hatched - 1:
+        if options.beside and number % options.beside == options.beside - 1:
             return draw_beside(options, key, stroke)
         return draw(options, jax.random.fold_in(key, stroke + 1))
 

@@ -266,10 +266,10 @@ def test_some_canvases_are_painted_side_by_side():
         for p in plans[1:]:
             jax.tree.map(np.testing.assert_array_equal, p.brush, plans[0].brush)
         # At random they would not be like that, and others are as without.
-        alone, ends, _ = paths(dataclasses.replace(options, hatched=0), number)
+        alone, ends, _ = paths(dataclasses.replace(options, beside=0), number)
         assert apart(ends)[0].max() > 20.0
         np.testing.assert_array_equal(alone[1].mix, plans[1].mix)
-    none = dataclasses.replace(options, hatched=0)
+    none = dataclasses.replace(options, beside=0)
     for mine, its in zip(paths(options, 3)[0], paths(none, 3)[0], strict=True):
         jax.tree.map(np.testing.assert_array_equal, mine, its)
 
@@ -293,6 +293,16 @@ def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     color = found[str(weights[1])]["errors"]
     assert color["on predicted height"]["delta_e"] != color["the network"]["delta_e"]
     assert "2 test pairs" in capsys.readouterr().out
+    # One network for both is judged in its two parts.
+    options = GeneratorConfig(4, width=0.05, mixes=True)
+    variables = Generator(options).init(jax.random.key(0), np.zeros((1, 8, 8, 10 + HEIGHT_INPUTS)))
+    single = tmp_path / "single.npz"
+    checkpoint.export(single, options, variables, {})
+    evaluate.main(evaluate.Config((single,), data=folder, out=tmp_path))
+    parts = json.loads((tmp_path / "metrics.json").read_text())[str(single)]["errors"]
+    for kind, path in zip(("height", "color"), weights, strict=True):
+        alone = found[str(path)]["errors"]["copy the background"]
+        assert parts[kind]["copy the background"]["rmse_masked"] == alone["rmse_masked"]
     with pytest.raises(SystemExit, match="no such weights: .*absent.npz"):
         evaluate.main(evaluate.Config((tmp_path / "absent.npz",), data=folder, out=tmp_path))
     options = GeneratorConfig(1, width=0.05)

@@ -71,6 +71,11 @@ def test_streamed_and_resident_pairs_give_the_same_batches():
         np.testing.assert_array_equal(a.target, pairs.batch.target[i])
 
 
+def test_pairs_are_brought_together_some_at_a_time():
+    pairs = toy(2 * feed.SOME + 3, side=8)
+    jax.tree.map(np.testing.assert_array_equal, feed.every(pairs), pairs.batch)
+
+
 def test_color_pairs_are_recolored_by_the_number_of_the_step():
     pairs = toy(5, side=8, kind="color")
     options = dataclasses.replace(SMALL, turns=False)
