@@ -76,8 +76,8 @@ def _needed(options, brush, stroke):
     return stamps_needed(stroke, options.pixel, np.inf, brush.press_depth)
 
 
-def _draw_and_count(options, box, canvas, track, color):
-    drawn = draw(options, box, canvas, track, color)
+def _draw_and_count(options, box, canvas, track, color, laid=None):
+    drawn = draw(options, box, canvas, track, color, laid)
     if isinstance(box, Rect):
         return drawn, jnp.any(drawn.mask > 0.0).astype(jnp.int32)
     return drawn, patches.needed(options.patches, box, drawn.mask[..., 0])

@@ -103,8 +103,8 @@ class Picture:
     height: (h, w) before, new_height: after [mm]. color, new_color: (h, w, 3). pressure, sweeps,
     time, load: (h, w) and trajectory: (h, w, 3) maps of the stroke; sweeps and load of a `Loaded`
     track, time by the clock of `on_way` [mm]. tip: (h, w) height of the latest bristle's tip [mm],
-    up to `COAT`. film: (h, w) height after, if paint did not flow, hair: (h, w) what was in it
-    last (`laid_film`) [mm]. picked: (h, w, 3), lift: (h, w) what bristles had picked up
+    up to `COAT`. film: (h, w) height after, if hair alone moved paint, hair: (h, w) what was
+    in it last (`laid_film`) [mm]. picked: (h, w, 3), lift: (h, w) what bristles had picked up
     (`picked_up`). mask: (h, w) 1 where it may have changed something. reached: () whether the
     brush stayed inside the simulated window.
     """
@@ -266,12 +266,14 @@ def loaded(track: BristleTrack, brush: BrushParams, load=LOAD, coat: float = COA
     return Loaded(**own, hairs=each * every, load=jnp.asarray(load, float) * every)
 
 
-def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
+def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None, laid=None):
     """Maps as the networks are told them.
 
     Args:
-      grid: pixels, as large as those of the canvas. canvas: (h, w) before the stroke, all of it.
-      color: (3,) of the paint, linear RGB. edge: as in `trajectory_maps`.
+      grid: pixels, as large as those of the canvas; all that the stroke touches of it, or else with
+        `laid`. canvas: (h, w) before the stroke, all of it. color: (3,) of the paint, linear RGB.
+        edge: as in `trajectory_maps`. laid: film and hair on the grid, as of `laid_film`, which
+        they else come from.
 
     Returns:
       (dict of pressure, sweeps by hairs in place of bristles, time by the track's clock, load where
@@ -283,7 +285,9 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
     carried = jnp.concatenate([to_srgb(picked), lift[..., None], tip[..., None]], axis=-1)
     maps = trajectory_maps(grid, track, carried, edge=edge)
     end = jnp.max(jnp.where(track.valid, track.time, 0.0))
-    film, hair = laid_film(grid, track, track.hairs[0], track.load[0], canvas.height)
+    if laid is None:
+        laid = laid_film(grid, track, track.hairs[0], track.load[0], canvas.height)
+    film, hair = laid
     return {
         "pressure": maps.pressure,
         "sweeps": track.hairs[0] * maps.sweeps,
@@ -293,7 +297,8 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None):
         "picked": maps.color[..., :3],
         "lift": maps.color[..., 3],
         "tip": maps.color[..., 4],
-        "film": film,
+        # Rounding, and two ways that paint leaves a thin film, take it some µm below.
+        "film": jnp.maximum(film, 0.0),
         "hair": hair,
     }, maps
 

@@ -197,14 +197,17 @@ def faded(cover):
     return share, cover
 
 
-def draw(options: PainterConfig, box: Box | Rect, canvas: Canvas, track: Loaded, color) -> Drawn:
+def draw(
+    options: PainterConfig, box: Box | Rect, canvas: Canvas, track: Loaded, color, laid=None
+) -> Drawn:  # fmt: skip
     """Draws the maps of a stroke on its box, scaled as in training pairs.
 
     Args:
-      canvas: before the stroke. track: from `trace`. color: (3,) of the paint, linear RGB.
+      canvas: before the stroke. track: from `trace`. color: (3,) of the paint, linear RGB. laid: as
+        in `drawn_maps`, on a box that does not hold all of the stroke.
     """
     grid, shape = patches.grid_of(options.patches, box, options.pixel), canvas.height.shape
-    told, maps = drawn_maps(grid, track, canvas, color, options.edge)
+    told, maps = drawn_maps(grid, track, canvas, color, options.edge, laid)
     at = patches.corner_of(options.patches, box)
     row, column = (at[k] + jnp.arange(grid.shape[k], dtype=jnp.int32) for k in (0, 1))
     inside = ((row >= 0) & (row < shape[0]))[:, None] & ((column >= 0) & (column < shape[1]))[None]

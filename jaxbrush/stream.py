@@ -6,6 +6,7 @@ with enough around its core is then painted as it would be as part of the whole 
 
 import collections
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +14,23 @@ import numpy as np
 
 from jaxbrush import painter, patches, stages
 from jaxbrush.canvas import Canvas
+from jaxbrush.film import Laid, lay_on
 from jaxbrush.painter import Nets, PainterConfig
 from jaxbrush.pairs import REACH
 from jaxbrush.patches import PatchConfig, Rect
+from jaxbrush.raster import Grid
 
 PATCHES = PatchConfig(192, 80)
 """The color network sees up to 15 pixels before and 24 behind of a height that has seen as much
 itself, twice what one network sees."""
+
+
+AROUND = 10
+"""Pixels around the tips in which hair lies in paint, and bilinear columns."""
+BORDER = PATCHES.size
+"""Pixels of film beyond the canvas: patches of it end there."""
+SIDES = (128, 256, 512, 1024)
+"""Sides of the rectangles that a piece lays its film in [pixels]."""
 
 
 def local(nets: Nets) -> bool:
@@ -44,6 +55,48 @@ def _core(options: PainterConfig, nets: Nets, canvas: Canvas, drawn, corner) -> 
 _paint = jax.jit(_core)
 
 
+@functools.partial(jax.jit, static_argnums=(0, 1))
+def _lay_on(pixel, canvas, corner, track, laid: Laid) -> Laid:
+    h, w = laid.film.shape
+    grid = Grid(origin=pixel * corner[::-1].astype(float), shape=(h, w), pixel=pixel)
+    return lay_on(grid, track, track.hairs[0], track.load[0], canvas, laid)
+
+
+class Film:
+    """The film of a stroke that goes on, on all of the canvas and `BORDER` around it.
+
+    Args:
+      height: of the canvas before [mm].
+    """
+
+    def __init__(self, pixel: float, height, bristles: int):
+        self.pixel, self.canvas = pixel, height.shape
+        self.film = np.pad(np.asarray(height), BORDER, mode="edge")
+        self.hair = np.zeros_like(self.film)
+        self.taken = np.zeros(bristles, self.film.dtype)
+
+    def add(self, track):
+        """Goes on with the next stamps; the first is the last one of before, if there was one."""
+        tip = track.position[track.valid][:, -1, :2] / self.pixel
+        if not len(tip):
+            return
+        low = np.floor(tip.min((0, 2)))[::-1].astype(int) - AROUND
+        high = np.ceil(tip.max((0, 2)))[::-1].astype(int) + AROUND
+        end = np.add(self.canvas, BORDER)
+        sides = [painter.bucket(n, SIDES) for n in high - low]
+        sides = np.minimum(sides, self.film.shape)
+        at = np.clip(low, -BORDER, end - sides)
+        here = tuple(slice(a + BORDER, a + BORDER + n) for a, n in zip(at, sides, strict=True))
+        laid = Laid(film=self.film[here], hair=self.hair[here], taken=self.taken)
+        laid = jax.device_get(_lay_on(self.pixel, self.canvas, at.astype(np.int32), track, laid))
+        self.film[here], self.hair[here], self.taken = laid.film, laid.hair, laid.taken
+
+    def on(self, corner, sides):
+        """(film, hair) on a rectangle of the canvas."""
+        here = tuple(slice(a + BORDER, a + BORDER + n) for a, n in zip(corner, sides, strict=True))
+        return self.film[here], self.hair[here]
+
+
 def _cells(low, high):
     """Numbers of the patches from that of one pixel y, x to that of another."""
     first, last = ((np.asarray(x, int)) // PATCHES.step for x in (low, high))
@@ -61,6 +114,7 @@ class Stream:
         self.options, self.nets, self.canvas, self.color = options, nets, canvas, color
         self.bounds = np.zeros((0, 4), np.float32)
         self._tracks, self._stamps, self._latest = [], 0, 0
+        self._film: Film | None = None
         self._wanted: set[tuple[int, int]] = set()
         self._touched = collections.defaultdict(int)  # stamps of the stroke when it last came there
         self._painted: dict[tuple[int, int], tuple[int, Canvas]] = {}
@@ -69,7 +123,13 @@ class Stream:
         """The next piece, final, of stamps that follow the last piece's; its first is that."""
         track, bounds = jax.device_get((track, bounds))
         painter.reached(self.canvas.height.shape, bounds)  # refuses what is not finite
+        if self._film is None:
+            height = self.canvas.height
+            self._film = Film(self.options.pixel, height, track.position.shape[-1])
         new = slice(1 if self._tracks else 0, int(track.valid.sum()))
+        fresh = track.valid.copy()
+        fresh[: new.start] = False
+        self._film.add(dataclasses.replace(track, valid=fresh))
         track, bounds = jax.tree.map(lambda x: x[new], track), bounds[new]
         self.bounds = np.concatenate([self.bounds, bounds])
         self._tracks.append(track)
@@ -102,7 +162,10 @@ class Stream:
         shape = self.canvas.height.shape
         if cell not in self._painted or self._painted[cell][0] < self._touched[cell]:
             rect = Rect(corner=jnp.asarray(corner), sides=(PATCHES.size,) * 2)
-            drawn, _ = painter.draw_on(self.options, rect, self.canvas, self.track(), self.color)
+            laid = self._film.on(corner, rect.sides)
+            drawn, _ = painter.draw_on(
+                self.options, rect, self.canvas, self.track(), self.color, laid
+            )
             part = _paint(self.options, self.nets, self.canvas, drawn, rect.corner)
             self._painted[cell] = self._stamps, jax.device_get(part)
         first = corner + PATCHES.lead

@@ -1,4 +1,5 @@
-"""The film that a stroke would leave if paint did not flow, and its hair, against closed forms."""
+"""The film that a stroke would leave if hair alone moved paint, and its hair, against closed
+forms."""
 
 import dataclasses
 import functools
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.film import MEMORY, laid_film
+from jaxbrush.film import BEHIND, LIFTED, MEMORY, Laid, laid_film, lay_on
 from jaxbrush.paint.state import make_params
 from jaxbrush.raster import make_grid
 
@@ -53,9 +54,11 @@ BARE = jnp.zeros((32, 80))
 
 def test_many_hairs_leave_their_equilibrium_and_thicker_paint_is_drawn_down_to_it():
     track = pulled(np.full(60, 2.0 + 0.5 * PIXEL))  # over the middle of row 16
-    for before in (0.0, 0.5 * EVEN, EVEN + 0.05):
+    # What stands above it is taken along, and what falls behind trembles with the stamps.
+    for before, off in ((0.0, 1e-3), (0.5 * EVEN, 1e-3), (EVEN + 0.05, 0.2)):
         after = np.asarray(film(track, BARE + before))[16, 24:48]
-        np.testing.assert_allclose(after, EVEN, rtol=1e-3)
+        np.testing.assert_allclose(after, EVEN, rtol=off)
+        assert after.mean() == pytest.approx(EVEN, rel=0.05)
         np.testing.assert_array_equal(film(track, BARE + before)[20], (BARE + before)[20])
 
 
@@ -139,7 +142,8 @@ def test_the_last_hair_counts():
     found = [
         float(hair(t, deep)[at]) for t in (dataclasses.replace(one, position=position), group, one)
     ]
-    assert found[1] == pytest.approx(12.0 * found[2], rel=1e-3)
+    # The more hair, the more of the paint is taken along, and hair at its surface out of it.
+    assert found[1] == pytest.approx(12.0 * found[2], rel=0.03)
     left = (found[0] - found[2]) / found[1]
     assert np.exp(-0.93 / MEMORY) < left < np.exp(-0.7 / MEMORY)
 
@@ -153,13 +157,74 @@ def test_stamps_twice_as_close_change_little():
         assert np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)) < 0.03 * change
 
 
-def test_a_part_of_the_canvas_is_as_the_whole_to_the_bit():
+def test_what_hair_takes_along_stays_where_it_lifts():
+    """Through wet paint to x = 7, and up."""
+    y = np.random.default_rng(1).uniform(1.6, 2.4, 60)
+    track = pulled(y, length=6.0)
+    risen = jnp.repeat(track.position[-1:], 5, axis=0)
+    risen = risen.at[:, :, 2].add(jnp.linspace(0.1, 0.5, 5)[:, None, None])
+    n = 66
+    track = dataclasses.replace(
+        track, time=jnp.arange(float(n)), valid=jnp.ones(n, bool),
+        position=jnp.concatenate([track.position, risen]),
+    )  # fmt: skip
+    wet = BARE + 0.3
+    grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
+    begun = Laid(film=wet, hair=BARE, taken=jnp.zeros(60))
+    track_of = lambda s: jax.tree.map(lambda x: x[s], track)  # noqa: E731
+    until = lay_on(grid, track_of(slice(0, 61)), 1.0, LOAD, (32, 80), begun)
+    laid = lay_on(grid, track_of(slice(60, n)), 1.0, LOAD, (32, 80), until)
+    held = float(until.taken.sum())
+    # What they hold while they go is what a millimetre of the way brings: of what is too much, the
+    # part that they do not lift.
+    assert 0.3 * held < 0.2 * BEHIND * 0.8 / PIXEL**2 * (1.0 - 0.5 * LIFTED) < 3.0 * held
+    assert float(laid.taken.sum()) < 0.02 * held
+    # It stays under the hair, 0.9 mm ahead of its tip, and nowhere else.
+    ridge = np.asarray(laid.film - until.film)
+    there = ridge[:, int(6.9 / PIXEL) : int(8.1 / PIXEL)].sum()
+    assert there == pytest.approx(held, rel=0.15) and there == pytest.approx(ridge.sum(), rel=0.02)
+    assert float(laid.film.max()) > 1.3 * 0.3
+
+
+def test_paint_that_is_taken_along_is_neither_made_nor_lost(monkeypatch):
+    """Hair that lays and lifts nothing itself."""
+    monkeypatch.setattr("jaxbrush.film.make_params", lambda: make_params(deposit=0.0))
+    track = pulled(np.random.default_rng(1).uniform(1.2, 2.8, 40), length=4.0)
+    start = BARE + 0.3
+    begun = Laid(film=start, hair=BARE, taken=jnp.zeros(40))
+    grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
+    laid = lay_on(grid, track, 1.0, LOAD, (32, 80), begun)
+    assert float(laid.taken.sum()) > 1.0
+    total = float(laid.film.sum() + laid.taken.sum())
+    assert total == pytest.approx(float(start.sum()), rel=1e-6)
+    assert float(laid.film.min()) >= 0.0
+
+
+def test_a_stroke_in_pieces_is_as_the_whole_to_the_bit():
     height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.2)
     track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
+    whole = both(track, height)
+    grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
+    laid = Laid(film=height, hair=BARE, taken=jnp.zeros(40))
+    go = jax.jit(lay_on, static_argnums=4)
+    for first in range(0, 140, 20):
+        piece = jax.tree.map(lambda x, a=first: x[a : a + 21], track)
+        piece = dataclasses.replace(piece, valid=piece.valid & (jnp.arange(21) >= int(first > 0)))
+        laid = go(grid, piece, 1.0, LOAD, (32, 80), laid)
+    np.testing.assert_array_equal(laid.film, whole[0])
+    np.testing.assert_array_equal(laid.hair, whole[1])
+
+
+def test_grids_that_hold_a_stroke_are_as_the_whole_canvas_to_the_bit():
+    height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.2)
+    track = pulled(np.random.default_rng(0).uniform(1.3, 2.7, 40), start=4.0, length=2.0)
     whole = np.asarray(film(track, height))
     origin = jnp.asarray([24 * PIXEL, 8 * PIXEL])
-    part = np.asarray(film(track, height, shape=(16, 32), origin=origin))
-    np.testing.assert_array_equal(part, whole[8:24, 24:56])
+    part = np.asarray(film(track, height, shape=(16, 40), origin=origin))
+    np.testing.assert_array_equal(part, whole[8:24, 24:64])
+    # So are those of one that comes from beyond the canvas and goes there.
+    track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
+    whole = np.asarray(film(track, height))
     # Off its edges the canvas goes on, as the networks see it.
     origin = jnp.asarray([-8 * PIXEL, -8 * PIXEL])
     around = np.asarray(film(track, height, shape=(48, 96), origin=origin))
