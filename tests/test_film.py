@@ -3,6 +3,7 @@ forms."""
 
 import dataclasses
 import functools
+from unittest import mock
 
 import jax
 import jax.numpy as jnp
@@ -10,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.film import BEHIND, LIFTED, MEMORY, Laid, laid_film, lay_on
+from jaxbrush.film import MEMORY, STANDS, WAKE, Laid, laid_film, lay_on
 from jaxbrush.paint.state import make_params
 from jaxbrush.raster import make_grid
 
@@ -36,9 +37,10 @@ def pulled(y, high=0.0, step=0.1, length=6.0, start=1.0):
     )  # fmt: skip
 
 
-@functools.partial(jax.jit, static_argnames="shape")
-def both(track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0)):
-    return laid_film(make_grid(shape, origin, PIXEL), track, hairs, load, height)
+@functools.partial(jax.jit, static_argnames=("shape", "wake"))
+def both(track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0), wake=WAKE):
+    with mock.patch("jaxbrush.film.WAKE", wake):
+        return laid_film(make_grid(shape, origin, PIXEL), track, hairs, load, height)
 
 
 def film(*args, **named):
@@ -50,15 +52,18 @@ def hair(*args, **named):
 
 
 BARE = jnp.zeros((32, 80))
+STILL = {"wake": 0.0}
+"""Hair that lays and lifts, and takes nothing along."""
 
 
 def test_many_hairs_leave_their_equilibrium_and_thicker_paint_is_drawn_down_to_it():
     track = pulled(np.full(60, 2.0 + 0.5 * PIXEL))  # over the middle of row 16
-    # What stands above it is taken along, and what falls behind trembles with the stamps.
-    for before, off in ((0.0, 1e-3), (0.5 * EVEN, 1e-3), (EVEN + 0.05, 0.2)):
+    for before in (0.0, 0.5 * EVEN, EVEN + 0.05):
+        after = np.asarray(film(track, BARE + before, **STILL))[16, 24:48]
+        np.testing.assert_allclose(after, EVEN, rtol=1e-3)
+        # What is taken along falls behind as the stamps come, so that the film trembles.
         after = np.asarray(film(track, BARE + before))[16, 24:48]
-        np.testing.assert_allclose(after, EVEN, rtol=off)
-        assert after.mean() == pytest.approx(EVEN, rel=0.05)
+        assert STANDS * EVEN < after.mean() < EVEN and after.max() < 1.6 * EVEN
         np.testing.assert_array_equal(film(track, BARE + before)[20], (BARE + before)[20])
 
 
@@ -98,7 +103,7 @@ def test_hair_that_leaves_the_paint_gives_nothing():
         track, time=jnp.arange(41.0), position=position, valid=jnp.ones(41, bool)
     )
     held = dataclasses.replace(more, valid=jnp.arange(41) < 31)
-    np.testing.assert_allclose(film(more, BARE), film(held, BARE), atol=1e-6)
+    np.testing.assert_allclose(film(more, BARE, **STILL), film(held, BARE, **STILL), atol=1e-6)
     # Pulled on while it rises slowly, it gives what it can.
     slow = pulled(np.full(60, 2.06))
     rise = jnp.linspace(0.0, 0.2, 61)[:, None, None]
@@ -108,7 +113,7 @@ def test_hair_that_leaves_the_paint_gives_nothing():
 
 def test_grooves_follow_single_hairs():
     # Two rows of hair, six pixels apart.
-    after = np.asarray(film(pulled([1.56] * 9 + [2.31] * 9), BARE))[:, 40]
+    after = np.asarray(film(pulled([1.56] * 9 + [2.31] * 9), BARE, **STILL))[:, 40]
     assert after[12] > 0.9 * EVEN and after[18] > 0.9 * EVEN and after[15] == 0.0
 
 
@@ -140,10 +145,10 @@ def test_the_last_hair_counts():
     group, one = (pulled([2.06] * n, start=x) for n, x in ((12, 2.0), (1, 0.0)))
     position = jnp.concatenate([group.position, one.position], axis=-1)
     found = [
-        float(hair(t, deep)[at]) for t in (dataclasses.replace(one, position=position), group, one)
+        float(hair(t, deep, **STILL)[at])
+        for t in (dataclasses.replace(one, position=position), group, one)
     ]
-    # The more hair, the more of the paint is taken along, and hair at its surface out of it.
-    assert found[1] == pytest.approx(12.0 * found[2], rel=0.03)
+    assert found[1] == pytest.approx(12.0 * found[2], rel=1e-3)
     left = (found[0] - found[2]) / found[1]
     assert np.exp(-0.93 / MEMORY) < left < np.exp(-0.7 / MEMORY)
 
@@ -151,10 +156,11 @@ def test_the_last_hair_counts():
 def test_stamps_twice_as_close_change_little():
     height = 0.1 * jnp.ones((32, 80))
     y = np.random.default_rng(0).uniform(1.5, 2.5, 24)
-    coarse, fine = (both(pulled(y, step=s), height) for s in (0.1, 0.05))
-    for a, b, before in zip(coarse, fine, (height, 0.0), strict=True):
-        change = np.abs(np.asarray(b) - before).max()
-        assert np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)) < 0.03 * change
+    for wake, most in ((0.0, 0.03), (WAKE, 0.12)):
+        coarse, fine = (both(pulled(y, step=s), height, wake=wake) for s in (0.1, 0.05))
+        for a, b, before in zip(coarse, fine, (height, 0.0), strict=True):
+            change = np.abs(np.asarray(b) - before).max()
+            assert np.sqrt(np.mean((np.asarray(a) - np.asarray(b)) ** 2)) < most * change
 
 
 def test_what_hair_takes_along_stays_where_it_lifts():
@@ -175,9 +181,9 @@ def test_what_hair_takes_along_stays_where_it_lifts():
     until = lay_on(grid, track_of(slice(0, 61)), 1.0, LOAD, (32, 80), begun)
     laid = lay_on(grid, track_of(slice(60, n)), 1.0, LOAD, (32, 80), until)
     held = float(until.taken.sum())
-    # What they hold while they go is what a millimetre of the way brings: of what is too much, the
-    # part that they do not lift.
-    assert 0.3 * held < 0.2 * BEHIND * 0.8 / PIXEL**2 * (1.0 - 0.5 * LIFTED) < 3.0 * held
+    # What they hold while they go is what some millimetres of the way bring.
+    brought = (0.3 - STANDS * EVEN) * 0.9 / PIXEL**2
+    assert brought < held < 5.0 * brought
     assert float(laid.taken.sum()) < 0.02 * held
     # It stays under the hair, 0.9 mm ahead of its tip, and nowhere else.
     ridge = np.asarray(laid.film - until.film)
@@ -200,7 +206,7 @@ def test_paint_that_is_taken_along_is_neither_made_nor_lost(monkeypatch):
     assert float(laid.film.min()) >= 0.0
 
 
-def test_a_stroke_in_pieces_is_as_the_whole_to_the_bit():
+def test_a_stroke_in_pieces_is_as_the_whole():
     height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.2)
     track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
     whole = both(track, height)
@@ -211,8 +217,8 @@ def test_a_stroke_in_pieces_is_as_the_whole_to_the_bit():
         piece = jax.tree.map(lambda x, a=first: x[a : a + 21], track)
         piece = dataclasses.replace(piece, valid=piece.valid & (jnp.arange(21) >= int(first > 0)))
         laid = go(grid, piece, 1.0, LOAD, (32, 80), laid)
-    np.testing.assert_array_equal(laid.film, whole[0])
-    np.testing.assert_array_equal(laid.hair, whole[1])
+    np.testing.assert_allclose(laid.film, whole[0], atol=1e-6)
+    np.testing.assert_allclose(laid.hair, whole[1], atol=1e-6)
 
 
 def test_grids_that_hold_a_stroke_are_as_the_whole_canvas_to_the_bit():
