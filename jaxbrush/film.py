@@ -10,7 +10,7 @@ Gaussians of 1 and 2.5 pixels) its correlation with the simulator's heights is 0
 A brush is full of paint that moves with it, two to four times as high as the film it leaves, the
 more the longer it goes over wet paint, and where it lifts that stays as a ridge. No network that
 sees a few millimetres knows how much it is. So each bristle takes up paint, carries it and lets go
-of it, and the film has the ridge: networks then have a tenth less error (README).
+of it, and the film has the ridge: networks then have a tenth less error (docs/networks.md).
 
 Where hair is pressed flat all along its way, every column comes to the same film, and what is left
 between the hairs is up to the flow: paint gathers where there is little hair. So the thickness of

@@ -126,6 +126,23 @@ def test_one_piece_patches_and_stream_paint_the_same(brush, before):
     assert found["none"] < 0.01 / 255.0 and found["instance"] > 2.0 / 255.0
 
 
+def test_patches_that_lay_their_own_film_miss_what_comes_from_beyond(brush, before, monkeypatch):
+    """Hair takes paint along, so the film of a patch depends on where the hair was."""
+    every = pieces(brush, hand("over"))
+
+    def painted():
+        begun = stream.Stream(OPTIONS, NETS, before, PAINT)
+        for piece in every:
+            begun.add(*piece)
+        track = begun.track(), begun.bounds
+        whole = painter.paint_track(OPTIONS, NETS, before, *track, PAINT)
+        return off(begun.result(), whole)
+
+    assert painted() < 0.01 / 255.0
+    monkeypatch.setattr(stream.Film, "on", lambda self, corner, sides: None)
+    assert painted() > 0.5 / 255.0
+
+
 def test_a_stroke_with_a_bad_track_or_too_long_is_refused(brush, before):
     begun = stream.Stream(OPTIONS, NETS, before, PAINT)
     track, bounds = pieces(brush, hand("over"))[0]
