@@ -115,6 +115,7 @@ class Stream:
         self.bounds = np.zeros((0, 4), np.float32)
         self._tracks, self._stamps, self._latest = [], 0, 0
         self._film: Film | None = None
+        self._bare = []  # pieces that have not laid their film: only a long stroke needs it
         self._wanted: set[tuple[int, int]] = set()
         self._touched = collections.defaultdict(int)  # stamps of the stroke when it last came there
         self._painted: dict[tuple[int, int], tuple[int, Canvas]] = {}
@@ -123,13 +124,10 @@ class Stream:
         """The next piece, final, of stamps that follow the last piece's; its first is that."""
         track, bounds = jax.device_get((track, bounds))
         painter.reached(self.canvas.height.shape, bounds)  # refuses what is not finite
-        if self._film is None:
-            height = self.canvas.height
-            self._film = Film(self.options.pixel, height, track.position.shape[-1])
         new = slice(1 if self._tracks else 0, int(track.valid.sum()))
         fresh = track.valid.copy()
         fresh[: new.start] = False
-        self._film.add(dataclasses.replace(track, valid=fresh))
+        self._bare.append(dataclasses.replace(track, valid=fresh))
         track, bounds = jax.tree.map(lambda x: x[new], track), bounds[new]
         self.bounds = np.concatenate([self.bounds, bounds])
         self._tracks.append(track)
@@ -162,7 +160,7 @@ class Stream:
         shape = self.canvas.height.shape
         if cell not in self._painted or self._painted[cell][0] < self._touched[cell]:
             rect = Rect(corner=jnp.asarray(corner), sides=(PATCHES.size,) * 2)
-            laid = self._film.on(corner, rect.sides)
+            laid = self._laid().on(corner, rect.sides)
             drawn, _ = painter.draw_on(
                 self.options, rect, self.canvas, self.track(), self.color, laid
             )
@@ -172,6 +170,16 @@ class Stream:
         low, high = np.maximum(first, 0), np.minimum(first + PATCHES.step, shape)
         at = tuple(slice(a, b) for a, b in zip(low - first, high - first, strict=True))
         return tuple(int(x) for x in low), jax.tree.map(lambda x: x[at], self._painted[cell][1])
+
+    def _laid(self) -> Film:
+        """The film of the stroke so far."""
+        if self._film is None:
+            bristles = self._tracks[0].position.shape[-1]
+            self._film = Film(self.options.pixel, self.canvas.height, bristles)
+        for track in self._bare:
+            self._film.add(track)
+        self._bare = []
+        return self._film
 
     def result(self, pause=lambda: None) -> Canvas:
         """The canvas with the whole stroke. pause: called before each patch yet to be painted."""
