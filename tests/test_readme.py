@@ -25,6 +25,21 @@ def test_code_runs(index, capsys):
     assert said and said[-1] in capsys.readouterr().out
 
 
-def test_pictures_exist():
-    for name in re.findall(r"\]\((docs/[^)]+)\)", README.read_text()):
-        assert (README.parent / name).is_file(), f"README.md shows {name}, which is missing"
+PAGES = [README, *sorted((README.parent / "docs").glob("*.md"))]
+
+
+@pytest.mark.parametrize("page", PAGES, ids=lambda page: page.name)
+def test_pictures_and_pages_exist(page):
+    links = re.findall(r"\]\((?!http)([^)#]+)\)", page.read_text())
+    assert links
+    for name in links:
+        assert (page.parent / name).is_file(), f"{page.name} shows {name}, which is missing"
+
+
+def test_every_picture_is_shown_and_every_command_named():
+    shown = "".join(page.read_text() for page in PAGES)
+    for picture in (README.parent / "docs").glob("*.[pg][ni][gf]"):
+        assert f"{picture.name})" in shown, f"docs/{picture.name} is shown nowhere"
+    for path in (README.parent / "experiments").glob("*.py"):
+        if 'if __name__ == "__main__"' in path.read_text():
+            assert path.stem in README.read_text(), f"README.md does not name {path.stem}"
