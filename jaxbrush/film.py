@@ -40,7 +40,7 @@ BEHIND = 1.0
 """Way [mm] on which what is taken along falls behind, by e."""
 STANDS = 0.5
 """Share of the film in equilibrium that is not taken along. If all of it stands, a stroke on bare
-canvas has no ridge at its end, and networks have 4 % more error; if none does, it is as with half,
+canvas has no ridge at its end, and networks have 3 % more error; if none does, it is as with half,
 but the film trembles more with the stamps."""
 LIFTED = 0.5
 """Rate at which hair takes paint out of a film that is too thick, as a share of that at which it
