@@ -192,24 +192,34 @@ def sheet(kind: str, nets: dict[str, checkpoint.Exported], found: data.Dataset, 
 
 
 def chart(kind: str, rows: list[dict], path: Path):
-    figure, axis = plt.subplots(figsize=(8.4, 5.0))
+    """Errors by name, and against the time to paint, where those that take the default's time have
+    no names."""
+    figure, (ranks, costs) = plt.subplots(1, 2, figsize=(10.0, 4.8), width_ratios=(1.3, 1.0))
+    rows = sorted(rows, key=lambda row: -row["masked"])
     noise = [r["masked"] for r in rows if r["name"] in ("default", "another seed")]
     if len(noise) == 2:
-        axis.axhspan(min(noise), max(noise), color=COLORS[0], alpha=0.15, lw=0)
+        ranks.axvspan(min(noise), max(noise), color=COLORS[0], alpha=0.15, lw=0)
+        costs.axhspan(min(noise), max(noise), color=COLORS[0], alpha=0.15, lw=0)
+    usual = next((r["ms"] for r in rows if r["name"] == "default"), None)
     labels = []
-    for row in rows:
+    for rank, row in enumerate(rows):
         own = row["name"] == "default"
-        axis.plot(row["ms"], row["masked"], "o", ms=8 if own else 5, color=COLORS[0 if own else 1])
-        labels.append((row["name"], (row["ms"], row["masked"]), {"fontsize": 8, "color": INK}))
-    axis.set_xscale("log")
-    axis.margins(x=0.3)
-    axis.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.xaxis.set_major_formatter("{x:g}")
-    axis.xaxis.set_minor_formatter(NullFormatter())
-    axis.set_xlabel(f"time to paint {SIDE} x {SIDE} pixels [ms]")
-    axis.set_ylabel("RMSE in the mask, network scale")
-    axis.set_title(f"{kind}: what each part is worth; the band is another seed")
-    label_points(axis, labels)
+        style = {"ms": 8 if own else 5, "color": COLORS[0 if own else 1]}
+        ranks.plot(row["masked"], rank, "o", **style)
+        costs.plot(row["ms"], row["masked"], "o", **style)
+        if own or usual is None or not 0.75 < row["ms"] / usual < 1.33:
+            labels.append((row["name"], (row["ms"], row["masked"]), {"fontsize": 8, "color": INK}))
+    ranks.set_yticks(range(len(rows)), [row["name"] for row in rows], fontsize=8)
+    ranks.set_xlabel("RMSE in the mask, network scale")
+    costs.set_xscale("log")
+    costs.margins(x=0.3)
+    costs.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+    costs.xaxis.set_major_formatter("{x:g}")
+    costs.xaxis.set_minor_formatter(NullFormatter())
+    costs.set_xlabel(f"time to paint {SIDE} x {SIDE} pixels [ms]")
+    costs.set_ylabel("RMSE in the mask, network scale")
+    figure.suptitle(f"{kind}: what each part is worth; the band is another seed")
+    label_points(costs, labels)
     save_figure(figure, path)
 
 
@@ -222,9 +232,10 @@ def main(options: Config) -> None:
         found = trained(options.kind, how, f"{number} of {len(variants)}: {name}")
         errors = found["errors"]["the network"]
         nets[name] = checkpoint.load(how.out / f"{options.kind}.npz")
-        ms = evaluate.milliseconds(nets[name], SIDE)
-        rows.append({"name": name, "ms": ms, "masked": errors["rmse_masked"], "steps":
-                     found["steps"], "best": found["best_step"], "errors": errors})  # fmt: skip
+        rows.append({"name": name, "masked": errors["rmse_masked"], "steps": found["steps"],
+                     "best": found["best_step"], "errors": errors})  # fmt: skip
+    spent = evaluate.milliseconds(list(nets.values()), SIDE)
+    rows = [row | {"ms": ms} for row, ms in zip(rows, spent, strict=True)]
     last = "volume_bias" if options.kind == "height" else "delta_e"
     table = [
         [r["name"], f"{r['ms']:.1f}", r["steps"], r["best"], f"{r['masked']:.4f}"]

@@ -70,7 +70,7 @@ def pictures(folder: Path, found: data.Dataset, index) -> dict[str, dict]:
         for name, (kind, _) in ALONE.items()
     }
     side = found.options.pairs.size
-    spent = {name: evaluate.milliseconds(net, side) for name, net in nets.items()}
+    spent = dict(zip(nets, evaluate.milliseconds(list(nets.values()), side), strict=True))
 
     def pairs(kind, net):
         return train_network.pairs_of(

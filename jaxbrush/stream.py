@@ -18,13 +18,10 @@ from jaxbrush.film import Laid, lay_on
 from jaxbrush.painter import Nets, PainterConfig
 from jaxbrush.pairs import REACH
 from jaxbrush.patches import PatchConfig, Rect
-from jaxbrush.raster import Grid
 
 PATCHES = PatchConfig(192, 80)
 """The color network sees up to 15 pixels before and 24 behind of a height that has seen as much
 itself, twice what one network sees."""
-
-
 AROUND = 10
 """Pixels around the tips in which hair lies in paint, and bilinear columns."""
 BORDER = PATCHES.size
@@ -57,8 +54,7 @@ _paint = jax.jit(_core)
 
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _lay_on(pixel, canvas, corner, track, laid: Laid) -> Laid:
-    h, w = laid.film.shape
-    grid = Grid(origin=pixel * corner[::-1].astype(float), shape=(h, w), pixel=pixel)
+    grid = patches.grid_of(PATCHES, Rect(corner=corner, sides=laid.film.shape), pixel)
     return lay_on(grid, track, track.hairs[0], track.load[0], canvas, laid)
 
 
@@ -86,15 +82,18 @@ class Film:
         sides = [painter.bucket(n, SIDES) for n in high - low]
         sides = np.minimum(sides, self.film.shape)
         at = np.clip(low, -BORDER, end - sides)
-        here = tuple(slice(a + BORDER, a + BORDER + n) for a, n in zip(at, sides, strict=True))
+        here = self._here(at, sides)
         laid = Laid(film=self.film[here], hair=self.hair[here], taken=self.taken)
         laid = jax.device_get(_lay_on(self.pixel, self.canvas, at.astype(np.int32), track, laid))
         self.film[here], self.hair[here], self.taken = laid.film, laid.hair, laid.taken
 
     def on(self, corner, sides):
         """(film, hair) on a rectangle of the canvas."""
-        here = tuple(slice(a + BORDER, a + BORDER + n) for a, n in zip(corner, sides, strict=True))
+        here = self._here(corner, sides)
         return self.film[here], self.hair[here]
+
+    def _here(self, corner, sides):
+        return tuple(slice(a + BORDER, a + BORDER + n) for a, n in zip(corner, sides, strict=True))
 
 
 def _cells(low, high):

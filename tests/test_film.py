@@ -113,8 +113,9 @@ def test_hair_that_leaves_the_paint_gives_nothing():
 
 def test_grooves_follow_single_hairs():
     # Two rows of hair, six pixels apart.
-    after = np.asarray(film(pulled([1.56] * 9 + [2.31] * 9), BARE, **STILL))[:, 40]
-    assert after[12] > 0.9 * EVEN and after[18] > 0.9 * EVEN and after[15] == 0.0
+    for named, least in ((STILL, 0.9), ({}, STANDS)):
+        after = np.asarray(film(pulled([1.56] * 9 + [2.31] * 9), BARE, **named))[:, 40]
+        assert min(after[12], after[18]) > least * EVEN and after[15] == 0.0
 
 
 def test_hair_in_the_film_has_the_volume_that_is_there():
