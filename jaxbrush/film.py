@@ -27,8 +27,12 @@ from jaxbrush.patches import cut_canvas
 from jaxbrush.raster import Grid
 from jaxbrush.structs import state
 
-SAMPLES = 4
-"""Points on the lowest part of a bristle: at its tip alone there is hardly a groove."""
+ENDS = (0.0, 0.06, 0.2, 0.5, 1.0)
+"""Of the lowest part of a bristle, from its tip: where the pieces end that one point each stands
+for. Hair that comes down touches with its tip alone, so the points are closer there: after the same
+1,000 updates networks have an error of 0.106 in the mask with these, 0.109 and 0.111 (two seeds)
+with four pieces of one length and 0.107 with eight, which take twice as long; 0.111 with three (0.1
+and 0.4 between them), 0.119 with two (0.2), 0.145 with one."""
 MEMORY = 0.75
 """Way [mm] over which the hair in the film is averaged, with weights that fall by e in it. With
 this map the height of a long pressed stroke is explained to 59, 57 and 86 % by octave, from the
@@ -104,10 +108,11 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
     film = jnp.append(laid.film.reshape(-1), 0.0)  # the last: off the grid
     hair = jnp.append(laid.hair.reshape(-1), 0.0)
 
-    share = jnp.asarray((np.arange(SAMPLES) + 0.5) / SAMPLES, film.dtype)
-    weight = (1.0 - 0.7 * share) * p.contact_area / (TUNED_HAIRS * SAMPLES * pixel**2)
+    share = jnp.asarray(0.5 * (np.asarray(ENDS[1:]) + np.asarray(ENDS[:-1])), film.dtype)
+    piece = jnp.asarray(np.diff(ENDS), film.dtype)  # of the length
+    weight = (1.0 - 0.7 * share) * piece * p.contact_area / (TUNED_HAIRS * pixel**2)
     # The hair tapers to half its cross-section at the tip.
-    volume = (0.5 + 0.5 * share) * jnp.pi * radius**2 * p.hair_length / (SAMPLES * pixel**2)
+    volume = (0.5 + 0.5 * share) * jnp.pi * radius**2 * p.hair_length * piece / pixel**2
     volume = hairs * volume[None, :, None]
     node = track.position[:, -2:].astype(film.dtype)
     up = node[:, 0] - node[:, 1]
@@ -124,9 +129,10 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
     stays = jnp.clip(1.0 - p.cling * rising / way[:, None], 0.0, 1.0)
     each = hairs * weight[None, :, None] * way[:, None] * stays
     kept = jnp.exp(-jnp.mean(way, axis=1) / MEMORY)
-    wake = hairs * WAKE * 2.0 * radius / (SAMPLES * pixel**2) * way[:, None] * stays
+    piece = piece[None, :, None]
+    wake = hairs * WAKE * 2.0 * radius / pixel**2 * piece * way[:, None] * stays
     # Hair that rises leaves all of it behind.
-    falls = 1.0 - jnp.exp(-way / BEHIND) * jnp.mean(stays, axis=1)
+    falls = 1.0 - jnp.exp(-way / BEHIND) * jnp.sum(piece * stays, axis=1)
     place = points[:, :2] / pixel - 0.5
     low = jnp.floor(place)
     place, high = place - low, jnp.maximum(points[:, 2], 0.0)
@@ -161,15 +167,18 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
         swept = moves * wake[None] * sunk
         # All along the hair, ahead of its tip, while any of it touches.
         lets = jnp.minimum(jnp.sum(moves * touch, axis=(0, 1)), 1.0)
-        left = moves * (lets * falls * taken / SAMPLES)[None, None]
+        left = moves * piece * (lets * falls * taken)[None, None]
         sums = jnp.stack([there, there * even, within, swept], axis=-1)
         sums = jnp.zeros((film.size, 4), film.dtype).at[cell].add(sums)[cell]
         met, drawn, full, wide = (sums[..., k] for k in range(4))
         some = jnp.where(met > 0.0, met, 1.0)
         wanted = drawn / some - under
         wanted = jnp.where(wanted < 0.0, LIFTED * wanted, wanted)
-        change = -jnp.expm1(-p.deposit * met) * wanted
-        part = -jnp.expm1(-wide) / jnp.where(wide > 0.0, wide, 1.0)
+        # Not by expm1, which takes an eighth of the scan: what this rounds off is no paint.
+        change = (1.0 - jnp.exp(-p.deposit * met)) * wanted
+        some_wide = wide > 1e-3
+        part = (1.0 - jnp.exp(-wide)) / jnp.where(some_wide, wide, 1.0)
+        part = jnp.where(some_wide, part, 1.0 - 0.5 * wide)
         new = part * swept * jnp.maximum(under - high[None] - stands, 0.0)
         comes = (1.0 - kept) * (full - hair[cell]) / jnp.where(full > 0.0, full, 1.0)
         return (

@@ -177,7 +177,7 @@ def place(options: PainterConfig, shape, bounds) -> Box | Rect | None:
         return None
     low, high = ([getattr(s, end) for s in there] for end in ("start", "stop"))
     if options.moments == "stroke":
-        rect = patches.rect_of(low, high, MARGIN, shape, options.sides)
+        rect = patches.rect_of(low, high, MARGIN, options.sides)
         if rect is not None:
             bounds = np.asarray(bounds)
             first = np.maximum(bounds[:, :2] - REACH, 0.0).astype(int)
@@ -198,7 +198,7 @@ def place_piece(options: PainterConfig, shape, bounds) -> Box | Rect | None:
     if there is None:
         return None
     low, high = ([getattr(s, end) for s in there] for end in ("start", "stop"))
-    rect = patches.rect_of(low, high, 0, shape, PIECES)
+    rect = patches.rect_of(low, high, 0, PIECES)
     return place(options, shape, bounds) if rect is None else rect
 
 

@@ -124,27 +124,22 @@ def box_of(options: PatchConfig, low, high, buckets) -> Box:
     )
 
 
-def rect_of(low, high, margin: int, canvas, buckets) -> Rect | None:
-    """The bucketed rectangle that holds the pixels from `low` to before `high` and, where the
-    canvas has them, `margin` more on each side; None if it is larger than the buckets. Not
-    jittable.
+def rect_of(low, high, margin: int, buckets) -> Rect | None:
+    """The bucketed rectangle that holds the pixels from `low` to before `high` and `margin` more on
+    each side, off the canvas, too: at its edges networks then see it go on, as in patches. None if
+    it is larger than the buckets. Not jittable.
 
     Args:
-      low, high: (2,) int y, x on the canvas. canvas: (h, w). buckets: sides, rising [pixels].
+      low, high: (2,) int y, x on the canvas. buckets: sides, rising [pixels].
     """
-    canvas = np.asarray(canvas, int)
     # Networks tell pixels apart by their number modulo 4, so rectangles begin where patches may.
-    low = np.maximum(np.asarray(low, int) - margin, 0) // 4 * 4
-    high = np.minimum(np.asarray(high, int) + margin, canvas)
+    low = (np.asarray(low, int) - margin) // 4 * 4
+    high = np.asarray(high, int) + margin
     sides = [next((b for b in buckets if n <= b), None) for n in high - low]
     if None in sides:
         return None
-    room = canvas - sides
-    corner = (low + high - sides) // 2
-    # Inside the canvas; where it is smaller, about its middle.
-    corner = np.where(room >= 0, np.clip(corner, 0, np.maximum(room, 0)), room // 2)
-    corner = np.minimum(corner // 4 * 4, low)
-    corner = np.maximum(corner, -(-(high - sides) // 4) * 4)
+    # About the middle, and it holds both ends.
+    corner = np.maximum((low + high - sides) // 2 // 4 * 4, -(-(high - sides) // 4) * 4)
     return Rect(corner=jnp.asarray(corner, jnp.int32), sides=tuple(sides))
 
 

@@ -57,7 +57,7 @@ class PainterConfig:
     edge: float | None = None
     stamps: tuple[int, ...] = (64, 128, 256, 512, 1024, 2048, 4096)
     cells: tuple[int, ...] = (2, 3, 4, 6, 8, 12, 16, 24, 32, 48)
-    sides: tuple[int, ...] = (96, 256, 512)
+    sides: tuple[int, ...] = (80, 128, 256, 512)
     batch: int = 1
 
     def __post_init__(self):

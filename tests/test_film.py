@@ -60,7 +60,7 @@ def test_many_hairs_leave_their_equilibrium_and_thicker_paint_is_drawn_down_to_i
     track = pulled(np.full(60, 2.0 + 0.5 * PIXEL))  # over the middle of row 16
     for before in (0.0, 0.5 * EVEN, EVEN + 0.05):
         after = np.asarray(film(track, BARE + before, **STILL))[16, 24:48]
-        np.testing.assert_allclose(after, EVEN, rtol=1e-3)
+        np.testing.assert_allclose(after, EVEN, rtol=3e-3)
         # What is taken along falls behind as the stamps come, so that the film trembles.
         after = np.asarray(film(track, BARE + before))[16, 24:48]
         assert STANDS * EVEN < after.mean() < EVEN and after.max() < 1.6 * EVEN
@@ -121,13 +121,13 @@ def test_grooves_follow_single_hairs():
 def test_hair_in_the_film_has_the_volume_that_is_there():
     # Hair that stays long enough in deep paint: its volume but for the taper, 0.75 on average.
     track = pulled([1.5, 2.5], length=0.0, start=3.0)
-    track = jax.tree.map(lambda x: jnp.repeat(x, 200, axis=0), track)
+    track = jax.tree.map(lambda x: jnp.repeat(x, 500, axis=0), track)
     deep = jnp.full((32, 80), 0.4)
     # Way is what counts, so hair that only rests leaves no trace.
-    assert float(hair(track, deep).max()) < 1e-5
-    sway = 0.05 * jnp.sin(jnp.arange(200.0))[:, None, None]
+    assert float(hair(track, deep).max()) < 1e-4
+    sway = 0.02 * jnp.sin(jnp.arange(500.0))[:, None, None]
     track = dataclasses.replace(
-        track, position=track.position.at[:, :, 0].add(sway), valid=jnp.ones(200, bool)
+        track, position=track.position.at[:, :, 0].add(sway), valid=jnp.ones(500, bool)
     )
     found = np.asarray(hair(track, deep, 2.0))
     one = np.pi * float(P.hair_radius) ** 2 * float(P.hair_length)

@@ -104,7 +104,7 @@ def test_only_the_mask_is_painted(name):
     assert check_painted(found, before, stroke).any()
 
 
-WHOLE = dataclasses.replace(OPTIONS, moments="stroke", blend="cut", sides=(64,))
+WHOLE = dataclasses.replace(OPTIONS, moments="stroke", blend="cut", sides=(80,))
 _paint_on = jax.jit(painter.paint_on, static_argnums=(0, 1))
 
 
@@ -113,7 +113,7 @@ def test_a_stroke_in_one_piece(name):
     before = canvas()
     stroke = jax.tree.map(jnp.asarray, line(*PATHS[name], 9))
     sizes, first = painter.plan(WHOLE, before, BRUSH, stroke)
-    assert sizes.sides == (64, 64) and sizes.count == 0
+    assert sizes.sides == (80, 80) and sizes.count == 0
     found = painter.paint_stroke(WHOLE, NETS, before, BRUSH, PAINT, stroke)
     assert check_painted(found, before, stroke).any()
     again, ok = _paint_on(WHOLE, sizes, NETS, before, BRUSH, jnp.asarray(PAINT), stroke, first)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxbrush import painter, stream
+from jaxbrush import painter, patches, stream
 from jaxbrush.brush import BrushConfig, make_brush
 from jaxbrush.canvas import Canvas
 from jaxbrush.models import Generator, GeneratorConfig
@@ -124,6 +124,23 @@ def test_one_piece_patches_and_stream_paint_the_same(brush, before):
         found[norm] = max(off(ways[0], w) for w in ways[1:])
     print(found)
     assert found["none"] < 0.01 / 255.0 and found["instance"] > 2.0 / 255.0
+
+
+def test_one_piece_and_patches_see_the_edge_of_the_canvas_alike(brush, before, monkeypatch):
+    """Both go on beyond it. A rectangle that ends with the canvas, where the networks' convolutions
+    are padded, is off by more than 2/255."""
+    begun = stream.Stream(OPTIONS, NETS, before, PAINT)
+    for piece in pieces(brush, hand("off")):
+        begun.add(*piece)
+    monkeypatch.setattr(painter, "MARGIN", 40)  # as far as the networks see
+    paint = lambda sides: painter.paint_track(  # noqa: E731
+        dataclasses.replace(OPTIONS, sides=sides), NETS, before, begun.track(), begun.bounds, PAINT
+    )
+    in_patches, rect = paint((64,)), patches.rect_of
+    assert off(paint((64, 256)), in_patches) < 0.01 / 255.0
+    inside = lambda *args: dataclasses.replace(rect(*args), corner=jnp.asarray([-12, 72]))  # noqa: E731
+    monkeypatch.setattr(patches, "rect_of", inside)
+    assert off(paint((64, 256)), in_patches) > 2.0 / 255.0
 
 
 def test_patches_that_lay_their_own_film_miss_what_comes_from_beyond(brush, before, monkeypatch):
