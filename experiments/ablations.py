@@ -218,6 +218,7 @@ def chart(kind: str, rows: list[dict], path: Path):
     costs.xaxis.set_minor_formatter(NullFormatter())
     costs.set_xlabel(f"time to paint {SIDE} x {SIDE} pixels [ms]")
     costs.set_ylabel("RMSE in the mask, network scale")
+    costs.set_title("without a name: about the default's time", fontsize=9, color=INK)
     figure.suptitle(f"{kind}: what each part is worth; the band is another seed")
     label_points(costs, labels)
     save_figure(figure, path)
