@@ -59,7 +59,7 @@ class PairConfig:
     way: float = 19.0
     spacing: float = 0.0625
     bristles: int = 128
-    paint: PaintConfig = PaintConfig(window=48)  # noqa: RUF009
+    paint: PaintConfig = PaintConfig(window=48, solver="chebyshev")  # noqa: RUF009
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
 
     def __post_init__(self):

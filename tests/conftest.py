@@ -1,6 +1,8 @@
 """Settings and fixtures that every test shares."""
 
+import gc
 import os
+from pathlib import Path
 
 WORKERS = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "1"))
 if WORKERS > 1:
@@ -15,6 +17,19 @@ import pytest  # noqa: E402
 
 jax.config.update("jax_numpy_rank_promotion", "raise")
 jax.config.update("jax_numpy_dtype_promotion", "strict")
+
+
+MAPS = Path("/proc/self/maps")
+MANY = 30_000
+"""Mapped regions from which on compiled functions are let go. Each keeps several, Linux allows a
+process 65,530, and past that compiling aborts it: all tests in one process come that far."""
+
+
+def pytest_runtest_teardown(item: pytest.Item, nextitem: pytest.Item | None) -> None:
+    moves_on = nextitem is not None and nextitem.path != item.path
+    if moves_on and MAPS.exists() and MAPS.read_bytes().count(b"\n") > MANY:
+        jax.clear_caches()
+        gc.collect()
 
 
 def pytest_runtest_setup(item: pytest.Item) -> None:

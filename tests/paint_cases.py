@@ -14,7 +14,7 @@ from jaxbrush.paint import (
     paint_stroke,
 )
 
-CONFIG = PaintConfig(layers=8, window=24, pigments=2, samples=4, sweeps=1)
+CONFIG = PaintConfig(layers=8, window=24, pigments=2, samples=4, solver="chebyshev")
 BRISTLES, STAMPS, SIDE = 40, 64, 56
 """Bristles; stamps that every stroke is padded to; cells along a side of the canvas."""
 MIDDLE = 0.5 * SIDE * CONFIG.pixel

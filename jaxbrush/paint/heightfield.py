@@ -37,7 +37,9 @@ THIN = 1e-4
 
 def heightfield_config(**changes) -> PaintConfig:
     """The settings of the height field; `changes` by name."""
-    values = dict(layers=2, layer=1.0, samples=3, viscous=4, pressure=8, spectrum=0.9)
+    values = dict(
+        layers=2, layer=1.0, samples=3, viscous=4, pressure=8, solver="chebyshev", spectrum=0.9
+    )
     return PaintConfig(**(values | changes))
 
 

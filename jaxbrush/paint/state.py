@@ -17,11 +17,12 @@ class PaintConfig:
 
     pixel, layer: cell size along and across the canvas [mm]. layers: cells above the canvas.
     window: cells along a side of the region that is simulated, around the brush. pigments: how
-    many are mixed. samples: points on each bristle's lowest part. sweeps: points of each along its
-    way from stamp to stamp. across: pixels that a bristle with its coat is wide, 1 for pixels of
-    0.125 mm, n for pixels n times finer. viscous, pressure: iterations. solver: of the pressure,
-    one of `SOLVERS`. spectrum: radius that Chebyshev's iteration is made for, below 1. limiter:
-    second-order lateral fluxes.
+    many are mixed. samples: points on each bristle's lowest part. sweeps: points of each along
+    its way from stamp to stamp. across: pixels that a bristle with its coat is wide, 1 for
+    pixels of 0.125 mm, n for pixels n times finer. viscous, pressure: iterations. solver: of
+    the pressure, one of `SOLVERS`; the default needs no radius, and the named settings take
+    Chebyshev's iteration, cheaper with theirs. spectrum: radius that it is made for, below 1.
+    limiter: second-order lateral fluxes.
     """
 
     pixel: float = 0.125
@@ -34,7 +35,7 @@ class PaintConfig:
     across: int = 1
     viscous: int = 9
     pressure: int = 20
-    solver: str = "chebyshev"
+    solver: str = "zline_pcg"
     spectrum: float = 0.95
     limiter: bool = True
 
