@@ -20,9 +20,9 @@ class PaintConfig:
     many are mixed. samples: points on each bristle's lowest part. sweeps: points of each along
     its way from stamp to stamp. across: pixels that a bristle with its coat is wide, 1 for
     pixels of 0.125 mm, n for pixels n times finer. viscous, pressure: iterations. solver: of
-    the pressure, one of `SOLVERS`; the default needs no radius, and the named settings take
-    Chebyshev's iteration, cheaper with theirs. spectrum: radius that it is made for, below 1.
-    limiter: second-order lateral fluxes.
+    the pressure, one of `SOLVERS`; the default needs no guess of the spectrum, `offline` and
+    `realtime` take Chebyshev's iteration, which is cheaper where few rounds do. spectrum: radius
+    that it is made for, below 1. limiter: second-order lateral fluxes.
     """
 
     pixel: float = 0.125
