@@ -68,6 +68,7 @@ VARIANTS = {
     "color": _BOTH | {
         "no new height": {"height": False}, "no recoloring": {"recolor": False},
         "a color, not shares": {"mixes": False},
+        "a color, not recolored": {"mixes": False, "recolor": False},
     },
 }  # fmt: skip
 """What each changes of the default."""

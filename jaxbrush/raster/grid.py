@@ -98,16 +98,12 @@ def dilate(mask, radius: int):
         done = 1
         while done < 2 * radius + 1:
             shift = min(done, 2 * radius + 1 - done)
-            pad = [(0, 0), (0, 0)]
-            pad[axis] = (shift, 0)
-            moved = jnp.pad(x, pad)
-            x = jnp.maximum(jax.lax.slice_in_dim(moved, 0, x.shape[axis], axis=axis), x)
+            n = x.shape[axis] - shift
+            near, far = (jax.lax.slice_in_dim(x, k, k + n, axis=axis) for k in (0, shift))
+            x = jnp.maximum(near, far)
             done += shift
         return x
 
     if radius < 0:
         raise ValueError(f"radius = {radius}: expected at least 0 pixels")
-    x = jnp.pad(jnp.asarray(mask), ((0, 2 * radius), (0, 2 * radius)))
-    x = along(along(x, 0), 1)
-    h, w = mask.shape
-    return x[radius : radius + h, radius : radius + w]
+    return along(along(jnp.pad(jnp.asarray(mask), radius), 0), 1)
