@@ -94,6 +94,25 @@ def _corner(grid: Grid):
     return jnp.round(grid.origin[::-1] / grid.pixel).astype(jnp.int32)
 
 
+@jax.custom_jvp
+def _meet(heap, last, cell, parts):
+    """Sums of parts (..., n) over all that are in the same cell: (heap (cells, n), sums).
+
+    heap: where they are added up, zero but in the cells `last`, those of the call before. Zeros
+    made anew for every stamp would have its time grow as the grid: a stroke from corner to corner
+    of 2048 x 2048 pixels took 3.6 times as long.
+    """
+    heap = heap.at[last].set(0.0).at[cell].add(parts)
+    return heap, heap[cell]
+
+
+@_meet.defjvp
+def _meet_jvp(primals, tangents):
+    heap, _, cell, _ = primals
+    zero = jnp.zeros_like(heap)
+    return _meet(*primals), (zero, zero.at[cell].add(tangents[3])[cell])
+
+
 def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> Laid:
     """Goes on with the film of a stroke; arguments as in `laid_film`, but track: its next stamps,
     the first of which only says where the hair was. canvas: (y, x) its size, static. laid: so far,
@@ -142,7 +161,7 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
     near = near & track.valid & jnp.any(high < reach + jnp.max(film), axis=(1, 2))
 
     def pass_over(carry, first, place, high, each, kept, wake, falls):
-        film, hair, taken = carry
+        film, hair, taken, heap, last = carry
         cells, shares, moving = [], [], []
         for dy in (0, 1):
             for dx in (0, 1):
@@ -169,7 +188,7 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
         lets = jnp.minimum(jnp.sum(moves * touch, axis=(0, 1)), 1.0)
         left = moves * piece * (lets * falls * taken)[None, None]
         sums = jnp.stack([there, there * even, within, swept], axis=-1)
-        sums = jnp.zeros((film.size, 4), film.dtype).at[cell].add(sums)[cell]
+        heap, sums = _meet(jax.lax.stop_gradient(heap), last, cell, sums)
         met, drawn, full, wide = (sums[..., k] for k in range(4))
         some = jnp.where(met > 0.0, met, 1.0)
         wanted = drawn / some - under
@@ -185,6 +204,8 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
             film.at[cell].add(there / some * change + left - new),
             hair.at[cell].add(within * comes),
             taken + jnp.sum(new - left, axis=(0, 1)),
+            jax.lax.stop_gradient(heap),
+            cell,
         )
 
     def step(carry, inputs):
@@ -192,5 +213,8 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
         return jax.lax.cond(near, pass_over, lambda carry, *_: carry, carry, *rest), None
 
     stamps = near, first, place, high, each, kept, wake, falls
-    (film, hair, taken), _ = jax.lax.scan(step, (film, hair, laid.taken), stamps)
+    heap = jnp.zeros((film.size, 4), film.dtype)
+    last = jnp.full((4, *points.shape[2:]), h * w, jnp.int32)
+    start = film, hair, laid.taken, heap, last
+    (film, hair, taken, *_), _ = jax.lax.scan(step, start, stamps)
     return Laid(film[:-1].reshape(h, w), hair[:-1].reshape(h, w), taken)
