@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.film import ENDS, MEMORY, STANDS, WAKE, Laid, laid_film, lay_on
+from jaxbrush.film import ENDS, MEMORY, STANDS, WAKE, Laid, _meet, laid_film, lay_on
 from jaxbrush.paint.state import make_params
 from jaxbrush.raster import make_grid
 
@@ -285,6 +285,58 @@ def test_slopes_are_those_of_differences_and_finite():
     np.testing.assert_allclose(slopes, (by_shift, by_height), rtol=0.03)
     none = jax.grad(lambda h: film(pulled([2.0], high=0.0), h).sum())(BARE)
     assert np.all(np.isfinite(none))
+
+
+def meet_naively(heap, last, cell, parts):
+    return heap, jnp.zeros_like(heap).at[cell].add(parts)[cell]
+
+
+def test_sums_over_cells_and_their_slopes_are_those_in_new_zeros():
+    def sums(meet, heap, last, cell, parts, way):
+        return jax.jvp(lambda x: meet(heap, last, cell, x)[1], [parts], [way])
+
+    rng = np.random.default_rng(0)
+    heap, last = jnp.zeros((50, 4)), jnp.full((4, 7), 49, jnp.int32)
+    for _ in range(4):
+        cell = jnp.asarray(rng.integers(0, 50, (4, 7)), jnp.int32)
+        parts, way = (jnp.asarray(rng.normal(size=(4, 7, 4)), jnp.float32) for _ in range(2))
+        want = sums(meet_naively, heap, last, cell, parts, way)
+        np.testing.assert_array_equal(sums(_meet, heap, last, cell, parts, way), want)
+        (heap, _), last = _meet(heap, last, cell, parts), cell
+
+
+def eqns_of(jaxpr):
+    for eqn in jaxpr.eqns:
+        yield eqn
+        for x in jax.tree.leaves(list(eqn.params.values())):
+            if hasattr(x, "eqns") or hasattr(x, "jaxpr"):
+                yield from eqns_of(getattr(x, "jaxpr", x))
+
+
+def made_in(jaxpr, alias=("scatter", "scatter-add", "stop_gradient")):
+    """Numbers in all arrays that a function makes anew, apart from updates in place."""
+    total = 0
+    for eqn in jaxpr.eqns:
+        inner = [x for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "eqns")]
+        total += sum(made_in(getattr(x, "jaxpr", x)) for x in inner)
+        if not inner and eqn.primitive.name not in alias:
+            total += sum(v.aval.size for v in eqn.outvars)
+    return total
+
+
+def test_a_stamp_takes_no_longer_on_a_larger_grid():
+    track = pulled([1.0, 2.0])
+
+    def made(side):
+        grid = make_grid((side, side), (0.0, 0.0), PIXEL)
+        lay = lambda height: laid_film(grid, track, 1.0, LOAD, height)  # noqa: E731
+        found = jax.make_jaxpr(lay)(jnp.zeros((side, side)))
+        scans = [e for e in eqns_of(found.jaxpr) if e.primitive.name == "scan"]
+        return sum(made_in(e.params["jaxpr"].jaxpr) for e in scans)
+
+    assert made(64) == made(256) < 2 * 64 * 64
+    with mock.patch("jaxbrush.film._meet", meet_naively):
+        assert made(256) > 10 * made(64) > 4 * 64 * 64  # the naive way
 
 
 def test_tips_alone_are_refused():
