@@ -200,21 +200,25 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
         part = jnp.where(some_wide, part, 1.0 - 0.5 * wide)
         new = part * swept * jnp.maximum(under - high[None] - stands, 0.0)
         comes = (1.0 - kept) * (full - hair[cell]) / jnp.where(full > 0.0, full, 1.0)
-        return (
-            film.at[cell].add(there / some * change + left - new),
-            hair.at[cell].add(within * comes),
-            taken + jnp.sum(new - left, axis=(0, 1)),
-            jax.lax.stop_gradient(heap),
-            cell,
-        )
+        new_film, new_hair = there / some * change + left - new, within * comes
+        taken = taken + jnp.sum(new - left, axis=(0, 1))
+        return new_film, new_hair, taken, jax.lax.stop_gradient(heap), cell
 
     def step(carry, inputs):
         near, *rest = inputs
-        return jax.lax.cond(near, pass_over, lambda carry, *_: carry, carry, *rest), None
+        film, hair, *others = carry
+        # Added here and not in the branch: XLA's CPU back end would work out what is scattered one
+        # number at a time.
+        *new, taken, heap, cell = jax.lax.cond(
+            near, pass_over, lambda *_: (none, none, *others), carry, *rest
+        )
+        film, hair = (x.at[cell].add(more) for x, more in zip((film, hair), new, strict=True))
+        return (film, hair, taken, heap, cell), None
 
     stamps = near, first, place, high, each, kept, wake, falls
     heap = jnp.zeros((film.size, 4), film.dtype)
     last = jnp.full((4, *points.shape[2:]), h * w, jnp.int32)
+    none = jnp.zeros(last.shape, film.dtype)
     start = film, hair, laid.taken, heap, last
     (film, hair, taken, *_), _ = jax.lax.scan(step, start, stamps)
     return Laid(film[:-1].reshape(h, w), hair[:-1].reshape(h, w), taken)
