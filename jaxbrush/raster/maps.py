@@ -102,6 +102,9 @@ def trajectory_maps(
     force, time = exact.values(sweeps, table, key, radius)
     covered = key > 0
     stamp, bristle = exact.decode(key, b * nodes)
+    # Where nothing draws, nothing is worn. Past a branch the colors are an array: what made them
+    # would else be worked out again at every pixel.
+    color = jax.lax.cond(jnp.any(covered), lambda x: x, jnp.zeros_like, color)
     worn = color[bristle] if color.ndim == 2 else color[stamp, bristle]
     dtype = force.dtype
     return TrajectoryMaps(
