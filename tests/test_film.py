@@ -313,13 +313,14 @@ def eqns_of(jaxpr):
                 yield from eqns_of(getattr(x, "jaxpr", x))
 
 
-def made_in(jaxpr, alias=("scatter", "scatter-add", "stop_gradient")):
+def made_in(jaxpr):
     """Numbers in all arrays that a function makes anew, apart from updates in place."""
+    in_place = ("scatter", "scatter-add", "stop_gradient")
     total = 0
     for eqn in jaxpr.eqns:
         inner = [x for x in jax.tree.leaves(list(eqn.params.values())) if hasattr(x, "eqns")]
         total += sum(made_in(getattr(x, "jaxpr", x)) for x in inner)
-        if not inner and eqn.primitive.name not in alias:
+        if not inner and eqn.primitive.name not in in_place:
             total += sum(v.aval.size for v in eqn.outvars)
     return total
 

@@ -1,8 +1,10 @@
 """Which bristle is the latest: order in time, also within a stamp, whatever the order of work."""
 
 import dataclasses
+import re
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from raster_cases import (
@@ -129,3 +131,21 @@ def test_more_sweeps_than_keys():
     )  # fmt: skip
     with pytest.raises(ValueError, match="16384 stamps x 2048 bristles"):
         jax.eval_shape(lambda t: trajectory_maps(canvas(), t), track)
+
+
+def looked_up_and_worked_out(function, *args):
+    """Whether a kernel of the compiled function takes logarithms of what it looks up."""
+    text = jax.jit(function).lower(*args).compile().as_text()
+    kernels = re.findall(r"^%\S+ \(.*?^}", text, re.MULTILINE | re.DOTALL)
+    return any(" log(" in kernel and " gather(" in kernel for kernel in kernels)
+
+
+@pytest.mark.skipif(jax.default_backend() != "cpu", reason="how XLA's CPU back end fuses")
+def test_what_bristles_carry_is_not_worked_out_at_every_pixel():
+    track, grid = random_track(2), canvas()
+    carried = jnp.ones((*track.position.shape[:1], track.position.shape[3], 3))
+    pixel = jnp.zeros((SIDE, SIDE), jnp.int32)
+    drawn = lambda x: trajectory_maps(grid, track, jnp.log(x), width=WIDTH).color  # noqa: E731
+    assert not looked_up_and_worked_out(drawn, carried)
+    naive = lambda x, at: jnp.log(x)[at, at]  # noqa: E731
+    assert looked_up_and_worked_out(naive, carried, pixel)
