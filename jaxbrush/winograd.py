@@ -128,9 +128,22 @@ def convolve(x, kernel):
     return y[:, : x.shape[1] - side + 1, : x.shape[2] - side + 1]
 
 
-def slopes(x, kernel, slope):
-    """Those of `convolve` at x and at the kernel, from that at its result."""
+def slopes(x, kernel, slope, padding):
+    """Those of `convolve` of a padded picture, at the picture without it and at the kernel.
+
+    Args:
+      x: (n, h, w, i), not padded. kernel: (k, k, i, o). slope: at the result.
+      padding: zeros (before, after) along both axes, each below k.
+
+    Returns:
+      Shaped as x and as kernel.
+    """
     edge = kernel.shape[0] - 1
-    around = jnp.pad(slope, ((0, 0), (edge, edge), (edge, edge), (0, 0)))
+    before, after = padding
+    around = _pad(slope, edge - before, edge - after)
     to_x = convolve(around, kernel[::-1, ::-1].swapaxes(2, 3))
-    return to_x, _kernel_slope(x, slope, kernel.shape[0])
+    return to_x, _kernel_slope(_pad(x, before, after), slope, kernel.shape[0])
+
+
+def _pad(x, before, after):
+    return jnp.pad(x, ((0, 0), (before, after), (before, after), (0, 0)))

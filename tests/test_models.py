@@ -8,7 +8,7 @@ import pytest
 from jax import lax
 
 from jaxbrush import models
-from jaxbrush.convolutions import UPSAMPLING, convolve, convolve_up
+from jaxbrush.convolutions import FEW, UPSAMPLING, convolve, convolve_up
 from jaxbrush.models import Discriminator, DiscriminatorConfig, Generator, GeneratorConfig
 
 LAYOUT = ("NHWC", "HWIO", "NHWC")
@@ -55,10 +55,11 @@ def some_variables(network, *args, scale=0.02, **options):
     return jax.tree_util.tree_map_with_path(fill, abstract)
 
 
+@pytest.mark.parametrize("outs", [5, FEW[0]])  # 8: where XLA's own slope of the kernel is taken
 @pytest.mark.parametrize("name", PLAIN)
-def test_convolutions_equal_the_plain_forms(name):
+def test_convolutions_equal_the_plain_forms(name, outs):
     ours, plain = PLAIN[name]
-    x, kernel = drawn(2, 8, 12, 3), drawn(4, 4, 3, 5, seed=1)
+    x, kernel = drawn(2, 8, 12, 3), drawn(4, 4, 3, outs, seed=1)
 
     def measured(function):
         def value(x, kernel):
@@ -86,6 +87,25 @@ def test_slope_of_a_kernel_by_products_of_matrices(ins, outs, side):
     slope = drawn(1, side, side + 1, outs, seed=2)
     found = jax.jit(c._kernel_slope_products)(x, kernel, slope)
     np.testing.assert_allclose(found, c._kernel_slope(x, kernel, slope), atol=1e-4)
+
+
+def test_the_slope_of_a_picture_is_not_computed_on_its_padding():
+    """Plain autodiff computes it there, too: (19 / 16)^2 as many pixels, and throws them away."""
+    x, kernel, slope = drawn(1, 16, 16, 32), drawn(4, 4, 32, 32), drawn(1, 16, 16, 32, seed=1)
+
+    def compiled(function):
+        pull = jax.jit(lambda x, s: jax.vjp(lambda x: function(x, kernel), x)[1](s))
+        return pull.lower(x, slope).compile().as_text()
+
+    def naive(x, kernel):
+        x = jnp.pad(x, ((0, 0), (1, 2), (1, 2), (0, 0)))
+        return lax.conv_general_dilated(x, kernel, (1, 1), "VALID", dimension_numbers=LAYOUT)
+
+    padded = "f32[1,19,19,32]{3,2,1,0} convolution("
+    assert padded in compiled(naive)
+    text = compiled(convolve)
+    assert padded not in text
+    assert "f32[1,16,16,32]{3,2,1,0} convolution(" in text
 
 
 # The appendix, kernel 4: name, inputs with skips, outputs, followed by N.
