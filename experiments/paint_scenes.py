@@ -111,6 +111,18 @@ def _layers():
     ]  # fmt: skip
 
 
+def _dry():
+    blue, black = {"blue": 0.8, "white": 0.2}, {"black": 1.0}
+    brushes = ("flat", {"orange": 1.0}), ("filbert", blue), ("fan", black)
+    hands = (0.3, 0.15), (0.12, 0.2), (0.06, 0.3), (0.04, 0.5)
+    touches = []
+    for j, (name, color) in enumerate(brushes):
+        for k, (load, pressure) in enumerate(hands):
+            start, y = 2.5 + 23.0 * j, 4.0 + 7.0 * k
+            touches.append(Touch(color, ((start, y), (start + 20.0, y)), name, load, pressure))
+    return touches
+
+
 def _sea():
     """Dusk over the sea: sky, sun, water, a boat, reeds."""
     random = np.random.default_rng(5)
@@ -166,9 +178,12 @@ def _sea():
 
 
 SCENES = {
-    "strokes": ((256, 576), _pressures), "layers": ((256, 528), _layers), "sea": ((264, 352), _sea)
+    "strokes": ((256, 576), _pressures), "layers": ((256, 528), _layers), "dry": ((256, 576), _dry),
+    "sea": ((264, 352), _sea),
 }  # fmt: skip
 """Size [pixels] and strokes of each sheet."""
+RELIEF = {"dry": 0.09}
+"""Depth of a sheet's weave [mm], where it is coarser than usual: a dry brush catches on it."""
 
 
 # shape, width, thickness, length, press depth [mm]: brushes such as the networks learned from

@@ -1,6 +1,6 @@
 """The paint catalogue: strokes by brush, pressure and load; layers; a small painting.
 
-python -m experiments.show_paint                    # three sheets
+python -m experiments.show_paint                    # four sheets
 python -m experiments.show_paint --only sea         # one of them
 python -m experiments.show_paint --quick            # four strokes
 """
@@ -19,7 +19,7 @@ import tyro
 from rich.progress import track
 
 from experiments.common import console, helped, print_table, results_folder, write_run
-from experiments.paint_scenes import BRISTLES, NAMES, PALETTE, SCENES, brush_of, hand
+from experiments.paint_scenes import BRISTLES, NAMES, PALETTE, RELIEF, SCENES, brush_of, hand
 from jaxbrush.brush import BrushConfig, rollout
 from jaxbrush.canvas import flatten
 from jaxbrush.paint import (
@@ -43,8 +43,8 @@ class Config:
 
     out: Path | None = None
     """Folder for the pictures [default: results/show_paint]."""
-    only: Literal["strokes", "layers", "sea"] | None = None
-    """One sheet of the three."""
+    only: Literal["strokes", "layers", "dry", "sea"] | None = None
+    """One sheet of the four."""
     quick: bool = False
     """Four strokes of the first sheet."""
     scale: int = 3
@@ -61,17 +61,23 @@ def total(config: PaintConfig, canvas, brush) -> float:
     return config.cell * float(np.asarray(canvas).sum(dtype=np.float64)) + held(brush)
 
 
-def paint(config: PaintConfig, spacing: float, touches, say: str):
-    """Paints strokes one after the other, stamps `spacing` apart [mm].
+def cloth(config: PaintConfig, name: str):
+    """Weave (y, x) of a sheet [mm]."""
+    relief = {"depth": RELIEF[name]} if name in RELIEF else {}
+    return jnp.asarray(weave(SHAPE, config.pixel, **relief), float)
+
+
+def paint(config: PaintConfig, spacing: float, touches, name: str):
+    """Paints the strokes of a sheet one after the other, stamps `spacing` apart [mm].
 
     Returns:
       (canvas, list of numbers of each stroke).
     """
     brush_config = BrushConfig()
     move, lay = jax.jit(rollout), jax.jit(paint_stroke)
-    tooth = jnp.asarray(weave(SHAPE, config.pixel), float)
+    tooth = cloth(config, name)
     canvas, rows = empty_canvas(config, SHAPE), []
-    for touch in track(touches, say, console=console):
+    for touch in track(touches, name, console=console):
         brush, params, depth = brush_of(touch.brush, brush_config)
         stroke = hand(touch.corners, touch.pressure, spacing, depth, touch.fall)
         bristles = move(brush_config, brush, stroke)
@@ -96,11 +102,10 @@ def paint(config: PaintConfig, spacing: float, touches, say: str):
     return canvas, rows
 
 
-def render(config: PaintConfig, canvas, shape, scale: int) -> np.ndarray:
+def render(config: PaintConfig, canvas, tooth, shape, scale: int) -> np.ndarray:
     """The lit canvas, cut to `shape` pixels, 8-bit BGR."""
     palette = jnp.asarray(list(PALETTE.values()))
     seen = flatten(canvas, config.layer, palette, mixing="subtractive")
-    tooth = jnp.asarray(weave(SHAPE, config.pixel), float)
     image = np.asarray(picture(shade(seen, config.pixel, weave=tooth)))
     image = image[: shape[0], : shape[1], ::-1]
     return cv2.resize(image, None, fx=scale, fy=scale, interpolation=cv2.INTER_CUBIC)
@@ -117,7 +122,8 @@ def main(options: Config) -> None:
         touches = touches()[: 4 if options.quick else None]
         canvas, rows = paint(config, spacing, touches, name)
         # Written under another name first, so that no half picture is left behind.
-        cv2.imwrite(str(folder / "partial.png"), render(config, canvas, shape, options.scale))
+        image = render(config, canvas, cloth(config, name), shape, options.scale)
+        cv2.imwrite(str(folder / "partial.png"), image)
         os.replace(folder / "partial.png", folder / f"{name}.png")
         numbers[name] = rows
         column = lambda key, rows=rows: [row[key] for row in rows]  # noqa: E731

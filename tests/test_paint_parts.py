@@ -293,7 +293,7 @@ def test_what_bristles_exchange_does_not_depend_on_the_layers():
         full = (jnp.arange(layers) < layers // 2).astype(float)
         paint = jnp.zeros((layers, 2, SIDE, SIDE)).at[:, 1].set(full[:, None, None])
         brush = BrushPaint(jnp.zeros((2, 4)).at[0].set(0.02), jnp.zeros((2, 4)))
-        after, left = transfer(config, params, paint, brush, hair, jnp.zeros((SIDE, SIDE)))
+        after, left = transfer(config, params, paint, brush, hair, jnp.zeros((2, SIDE, SIDE)))
         gained.append(float(left.tip[1].sum()))
         there = config.cell * float(paint.sum() - after.sum())
         assert there == pytest.approx(float(left.tip.sum()) - 0.08, abs=1e-7)

@@ -4,12 +4,14 @@ import dataclasses
 import functools
 
 import cv2
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 from paint_cases import (
     CONFIG,
     MIDDLE,
+    SIDE,
     STAMPS,
     bare,
     brush_of,
@@ -20,10 +22,12 @@ from paint_cases import (
     params_of,
     slab,
     stroke,
+    track,
 )
 
 from experiments.paint_cases import thinned, track_of
-from jaxbrush.paint import empty_canvas, height, load_brush, presets
+from jaxbrush.paint import empty_canvas, height, load_brush, paint_stroke, presets, weave
+from jaxbrush.paint.rollout import stamp
 
 CELL = CONFIG.pixel**2
 
@@ -181,6 +185,35 @@ def test_nothing_happens_between_an_empty_brush_and_a_bare_canvas():
     canvas, brush, report = paint(bare(), brush_of(0.0))
     assert not np.any(np.asarray(canvas)) and not held(brush).any()
     assert np.all(np.isfinite(np.asarray(report.residual)))
+
+
+def test_a_dry_brush_paints_the_threads_of_a_coarse_weave_and_a_full_one_fills_it():
+    """Naively hair follows the cloth, and lays more between the threads than on them; and film
+    that flows at the speed of a whole cell is dragged off the threads again."""
+    depth = 0.09
+    tooth = weave((SIDE, SIDE), CONFIG.pixel, depth)
+    moves = track(low=-0.06, length=4.8, step=0.08)
+
+    def limp(config, params, paint, brush, points, cloth):
+        return stamp(config, params, paint, brush, points, jnp.stack([cloth[0], cloth[0]]))
+
+    def films(load, one=stamp, **changes):
+        params = params_of(**changes)
+        brush = brush_of(load, params=params)
+        after = jax.jit(paint_stroke, static_argnums=(0, 6))(
+            CONFIG, params, bare(), brush, moves, jnp.asarray(tooth, float), one
+        )
+        check_sound((bare(), brush), after[:2])
+        part = np.s_[18:38, 28:44]  # the second half of the stroke, inside its sides
+        inside, height = film(after[0])[part], tooth[part]
+        return inside[height > 0.75 * depth].mean(), inside[height < 0.25 * depth].mean()
+
+    threads, between = films(0.02)
+    flows, limps, full = films(0.02, bound=0.0), films(0.02, limp, bound=0.0), films(0.8)
+    print("film on threads and between [mm]:", threads, between, flows, limps, full)
+    assert threads > 4.0 * between
+    assert flows[0] < 2.5 * flows[1] and limps[0] < 0.8 * limps[1]
+    assert full[1] > full[0] > 0.1
 
 
 # The real brush as data are made with it: 260 bristles, a window of 64 cells.

@@ -69,8 +69,9 @@ def _upwind(fill, width, face):
     return starts, [wide(s, width) for s in slopes]
 
 
-def advect(config: PaintConfig, paint, face):
-    """Moves pigments (z, k, n) by wide face displacements [cells], all below one cell.
+def advect(config: PaintConfig, paint, face, bound=0.0):
+    """Moves pigments (z, k, n) by wide face displacements [cells], all below one cell; but for a
+    film of `bound` [mm] on the canvas, which a cell's speed is far too fast for: it sticks.
 
     One scalar flux of paint a face carries the pigments in the shares of the cell it leaves, and
     no cell gives more than it has: amounts stay positive, colors in the hull of what was there.
@@ -79,6 +80,9 @@ def advect(config: PaintConfig, paint, face):
     # A row more in the margins than `near` elsewhere reads.
     fill = wide(jnp.sum(paint, axis=1), 2 * width)
     here = near(fill, 2 * width)
+    loose = 1.0 - bound / config.layer / jnp.maximum(here[:1], TINY)
+    loose = jnp.maximum(jnp.pad(loose, ((0, here.shape[0] - 1), (0, 0)), constant_values=1.0), 0.0)
+    free = wide(loose, width)
     steps = ((1, 0), (width, 0), (0, 1))
     if config.limiter:
         starts, slopes = _upwind(fill, width, face[:2])
@@ -92,6 +96,7 @@ def advect(config: PaintConfig, paint, face):
             left, right = jnp.maximum(left, 0.0), jnp.maximum(right, 0.0)
         else:
             left, right = here, near(fill, 2 * width, shift, layer)
+        left, right = left * loose, right * near(free, width, shift, layer)
         fluxes.append(wide(q * jnp.where(q > 0.0, left, right), width))
     for (shift, layer), flux in zip(steps, fluxes, strict=True):
         out = out + jnp.maximum(near(flux, width), 0.0)

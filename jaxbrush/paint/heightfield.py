@@ -167,11 +167,12 @@ def fall(config: PaintConfig, params: PaintParams, top, surface, hairy, step):
     return faces
 
 
-def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, points, tooth):
+def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, points, cloth):
     """One stamp on a window.
 
     Args:
-      paint: (2, k, y, x) [mm]. points: Hair relative to the window. tooth: (y, x) [mm].
+      paint: (2, k, y, x) [mm]. points: Hair relative to the window. cloth: (2, y, x) heights of the
+        weave and of its threads [mm].
 
     Returns:
       (paint, brush, residual (4,): two viscous solves, 0, and the pressure).
@@ -188,15 +189,15 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
     paint = stored(repack(paint, jnp.stack([below, jnp.full_like(below, 1e6)])), one)
 
     # Exchange is with the upper film, so heights count from the lower one.
-    under = jnp.sum(paint[0], axis=0)
-    raised = points.place.at[2].set(z - columns(config, under.reshape(size, size), points.place))
+    under = jnp.sum(paint[0], axis=0).reshape(size, size)
+    raised = points.place.at[2].set(z - columns(config, under, points.place))
     top, brush = transfer(
         config,
         dataclasses.replace(params, compliance=0.0 * params.compliance),
         paint[1:].reshape(1, *shape[1:]),
         brush,
         dataclasses.replace(points, place=raised),
-        tooth,
+        jnp.maximum(cloth - under[None], 0.0),
     )
     top = top.reshape(1, config.pigments, -1)
     paint = stored(jnp.concatenate([paint[:1], top]), one)
@@ -228,7 +229,7 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
         lower = 0.5 * (near(follows, size) + near(follows, size, shift)) * near(f, size)
         both.append(wide(jnp.concatenate([lower, near(f, size) + s]), size))
     still = jnp.zeros((4, size * size + 2 * size), u.dtype)
-    paint = advect(config, paint, [*both, still])
+    paint = advect(config, paint, [*both, still], params.bound)
     return paint.reshape(shape), brush, jnp.concatenate([rough, 0.0 * left, left])
 
 

@@ -7,7 +7,7 @@ from jaxbrush.paint.advection import advect, repack, slump
 from jaxbrush.paint.hair import hair
 from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams
 from jaxbrush.paint.stencil import stored
-from jaxbrush.paint.transfer import refill, ride, transfer
+from jaxbrush.paint.transfer import refill, ride, threads, transfer
 from jaxbrush.paint.velocity import flow, splat
 from jaxbrush.structs import state
 
@@ -31,18 +31,19 @@ def _near(field, cells: int):
     )
 
 
-def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, points, tooth):
+def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, points, cloth):
     """One stamp on a window.
 
     Args:
-      paint: (z, k, y, x). points: Hair relative to the window. tooth: (y, x) [mm].
+      paint: (z, k, y, x). points: Hair relative to the window. cloth: (2, y, x) heights of the
+        weave and of its `threads` [mm].
 
     Returns:
       (paint, brush, residual (4,)).
     """
     one = 1.0 + 0.0 * points.step
     shape = paint.shape
-    paint, brush = transfer(config, params, paint, brush, points, tooth)
+    paint, brush = transfer(config, params, paint, brush, points, cloth)
     paint = stored(paint, one)
     brush = refill(config, params, brush, points.travel)
     z, _ = ride(config, params, paint, points)
@@ -53,7 +54,7 @@ def stamp(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, po
     paint = stored(paint, one)
     fill = stored(jnp.sum(paint, axis=1), one)
     moved = flow(config, params, fill, phi, motion, points.step)
-    paint = stored(advect(config, paint, moved.face), one)
+    paint = stored(advect(config, paint, moved.face, params.bound), one)
     paint = repack(paint, 1.0 - phi)
     return paint.reshape(shape), brush, moved.residual
 
@@ -92,7 +93,9 @@ def paint_stroke(
             f"{brush.tip.shape}: expected at least 2 nodes and {(k, b)}"
         )
     if tooth is None:
-        tooth = jnp.zeros((h, w), canvas.dtype)
+        cloth = jnp.zeros((2, h, w), canvas.dtype)
+    else:
+        cloth = jnp.stack([tooth, threads(config, tooth)])
     nodes = track.position[:, -2:].astype(canvas.dtype)
     # (t, 3, 2, b) with the tip last on the third axis
     nodes = jnp.swapaxes(nodes, 1, 2)
@@ -114,11 +117,11 @@ def paint_stroke(
         active = jnp.where(valid, jnp.ones(b.shape[-1], canvas.dtype), 0.0)
         points = hair(config, params, local(a), local(b), dt, active)
         window = jax.lax.dynamic_slice(canvas, (0, 0, y, x), (layers, k, size, size))
-        cloth = jax.lax.dynamic_slice(tooth, (y, x), (size, size))
+        under = jax.lax.dynamic_slice(cloth, (0, y, x), (2, size, size))
         # Padding costs nothing. (Under vmap both branches run, and the right one is taken.)
         painted, wet, residual = jax.lax.cond(
             valid,
-            lambda: stamp(config, params, window, brush, points, cloth),
+            lambda: stamp(config, params, window, brush, points, under),
             lambda: (window, brush, jnp.zeros(4, window.dtype)),
         )
         canvas = jax.lax.dynamic_update_slice(canvas, painted, (0, 0, y, x))

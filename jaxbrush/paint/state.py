@@ -94,6 +94,7 @@ class PaintParams:
     drag: jax.Array  # Brinkman drag of the hair over viscosity, per hair fraction [1/mm^2]
     lid: jax.Array  # share of upward flow that the bed of hair stops
     source: jax.Array  # share of an overfull cell's excess that flows out in a stamp
+    bound: jax.Array  # film next to the cloth that does not flow [mm]
     yield_share: jax.Array  # flow below this share of the brush's travel stops
     relax: jax.Array  # [mm^2/mm] at which steep slopes of the surface diffuse near hair
     relax_slope: jax.Array  # slope that stands
@@ -111,7 +112,7 @@ def make_params(**changes) -> PaintParams:
         "compliance": 0.4, "tip_volume": 7.5, "reservoir_volume": 63.0, "contact_area": 20.0,
         "deposit": 12.8, "squeeze": 0.4, "cling": 4.0, "pickup": 4.0, "exchange": 0.48,
         "exchange_depth": 0.125, "refill": 0.8, "soak": 10.0, "drag": 256.0, "lid": 0.9,
-        "source": 1.0, "yield_share": 0.02, "relax": 0.015625, "relax_slope": 0.752,
+        "source": 1.0, "bound": 0.012, "yield_share": 0.02, "relax": 0.015625, "relax_slope": 0.752,
         "opacity": 0.03,
     }  # fmt: skip
     unknown = set(changes) - set(values)

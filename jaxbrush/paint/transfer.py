@@ -5,12 +5,15 @@ rides and how thick its coat is. One array of what really moved feeds both sides
 and every pigment are conserved to rounding.
 """
 
+import jax
 import jax.numpy as jnp
 
 from jaxbrush.paint.hair import Hair, corners
 from jaxbrush.paint.state import BrushPaint, PaintConfig, PaintParams
 
 TINY = 1e-9
+SPAN = 0.25
+"""How far to each side hair lies on the highest thread [mm]."""
 
 
 def _rate(k, travel):
@@ -39,12 +42,23 @@ def ride(config: PaintConfig, params: PaintParams, paint, hair: Hair):
     return height + params.compliance * jnp.maximum(under - height, 0.0), under
 
 
-def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, hair: Hair, tooth):
+def threads(config: PaintConfig, tooth):
+    """Height of what hair lies on over a weave (y, x) [mm]: the highest within `SPAN`."""
+    side = 2 * round(SPAN / config.pixel) + 1
+    return jax.lax.reduce_window(
+        tooth, jnp.asarray(-jnp.inf, tooth.dtype), jax.lax.max, (side, side), (1, 1), "SAME"
+    )
+
+
+def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint, hair: Hair, cloth):
     """Moves paint between brush and window in one stamp.
+
+    Hair is too stiff to follow the weave: it lies on the threads, and what hangs from it reaches
+    down between them only as far as its coat is thick. So a dry brush paints threads alone.
 
     Args:
       paint: (z, k, y, x) window. brush: paint of b bristles. hair: points, relative to the window.
-      tooth: (y, x) height of the canvas's weave [mm].
+      cloth: (2, y, x) height of the canvas's weave and of the `threads` around [mm].
 
     Returns:
       (paint, brush).
@@ -60,9 +74,12 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     coat = radius * (params.coat_dry + params.coat_full * jnp.minimum(load, 1.3))
 
     z, film = ride(config, params, paint, hair)
-    above = jnp.maximum(z - columns(config, tooth, hair.place), 0.0)
+    low, high = (columns(config, cloth[k], hair.place) for k in (0, 1))
+    z = jnp.maximum(z, high)
+    above = z - low
     reach = (radius + coat)[None]
-    touch = jnp.clip((reach - (above - film)) / reach, 0.0, 1.0) * hair.weight
+    touch = jnp.clip((reach - (z - high - film)) / reach, 0.0, 1.0) * hair.weight
+    touch = touch * (1.0 - jnp.clip((high - low - film) / coat[None], 0.0, 1.0))
     even = jnp.maximum(above + 0.7 * coat[None] - radius, 0.0)
     rising = jnp.maximum(hair.motion[2], 0.0) / hair.travel[None]
     rate = lambda k: _rate(k, hair.travel)[None]  # noqa: E731
