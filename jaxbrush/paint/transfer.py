@@ -115,7 +115,7 @@ def transfer(config: PaintConfig, params: PaintParams, paint, brush: BrushPaint,
     lost = total * granted / jnp.maximum(fill, TINY)
     by = taken / jnp.maximum(fill, TINY)[index]
     plane = shape[1] * shape[2]
-    level, column = index // plane, index % plane
+    level, column = jax.lax.div(index, plane), jax.lax.rem(index, plane)
     # (k, 8, n): the same cells of each pigment, which lie a plane apart.
     pigment = jnp.arange(pigments, dtype=jnp.int32)[:, None, None]
     cells = (level[None] * pigments + pigment) * plane + column[None]

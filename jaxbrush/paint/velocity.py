@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxbrush.paint.hair import Hair, corners
 from jaxbrush.paint.solvers import Matrix, residual, solve
 from jaxbrush.paint.state import PaintConfig, PaintParams
-from jaxbrush.paint.stencil import inner_x, inner_y, near, wide
+from jaxbrush.paint.stencil import inner_x, inner_y, near, stored, wide
 from jaxbrush.structs import state
 
 
@@ -48,7 +48,7 @@ def splat(config: PaintConfig, hair: Hair, z):
     plane = config.window**2
     rows = jnp.concatenate([mass[None], mass[None] * motion])
     # (4, 8, n) into (z, 4, n)
-    level, column = index // plane, index % plane
+    level, column = jax.lax.div(index, plane), jax.lax.rem(index, plane)
     number = (4 * level[None] + jnp.arange(4, dtype=jnp.int32)[:, None, None]) * plane + column[
         None
     ]
@@ -229,5 +229,6 @@ def flow(config: PaintConfig, params: PaintParams, fill, phi, motion, step) -> F
     u, rough = viscous(config, params, fill, phi, motion)
     face = [wide(f, width) for f in faces_of(config, u)]
     face, left = project(config, params, fill, phi, face)
+    face = stored(face, 1.0 + 0.0 * params.drag)
     face = stop(params, config, [wide(f, width) for f in face], step)
-    return Flow(face=face, residual=jnp.concatenate([rough, left]))
+    return Flow(face=stored(face, 1.0 + 0.0 * params.drag), residual=jnp.concatenate([rough, left]))
