@@ -225,10 +225,9 @@ def stop(params: PaintParams, config: PaintConfig, face, step):
 
 def flow(config: PaintConfig, params: PaintParams, fill, phi, motion, step) -> Flow:
     """Displacement of the paint in one stamp: fill, phi (z, n), motion (z, 3, n)."""
-    width = config.window
+    one, width = 1.0 + 0.0 * params.drag, config.window
     u, rough = viscous(config, params, fill, phi, motion)
     face = [wide(f, width) for f in faces_of(config, u)]
     face, left = project(config, params, fill, phi, face)
-    face = stored(face, 1.0 + 0.0 * params.drag)
-    face = stop(params, config, [wide(f, width) for f in face], step)
-    return Flow(face=stored(face, 1.0 + 0.0 * params.drag), residual=jnp.concatenate([rough, left]))
+    face = stop(params, config, [wide(f, width) for f in stored(face, one)], step)
+    return Flow(face=stored(face, one), residual=jnp.concatenate([rough, left]))
