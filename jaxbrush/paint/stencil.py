@@ -23,7 +23,10 @@ def stored(tree, one):
 
 
 def wide(planes, width: int):
-    """(z, ..., n) to (z + 2, ..., n + 2 width), zeros around, stored."""
+    """(z, ..., n) to (z + 2, ..., n + 2 width), zeros around.
+
+    Values that took work should be `stored` before: XLA may make padding of this and fuse it.
+    """
     layers, *parts, n = planes.shape
     zeros = jnp.zeros((layers + 2, *parts, n + 2 * width), planes.dtype)
     return jax.lax.dynamic_update_slice(zeros, planes, (1, *[0] * len(parts), width))
