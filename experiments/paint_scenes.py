@@ -112,8 +112,8 @@ def _layers():
 
 
 def _dry():
-    blue, black = {"blue": 0.8, "white": 0.2}, {"black": 1.0}
-    brushes = ("flat", {"orange": 1.0}), ("filbert", blue), ("fan", black)
+    blue, green = {"blue": 0.8, "white": 0.2}, {"green": 0.7, "black": 0.3}
+    brushes = ("flat", {"orange": 1.0}), ("filbert", blue), ("round", green)
     hands = (0.3, 0.15), (0.12, 0.2), (0.06, 0.3), (0.04, 0.5)
     touches = []
     for j, (name, color) in enumerate(brushes):

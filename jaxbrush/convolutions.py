@@ -13,6 +13,7 @@ import numpy as np
 from jax import lax
 
 from jaxbrush import winograd
+from jaxbrush.winograd import pad
 
 KERNEL = 4
 """Side of every kernel (paper, appendix)."""
@@ -28,10 +29,6 @@ TRANSPOSED = np.zeros((2, 3, KERNEL), np.float32)
 TRANSPOSED[0, 0, 3] = TRANSPOSED[0, 1, 1] = TRANSPOSED[1, 1, 2] = TRANSPOSED[1, 2, 0] = 1.0
 
 UPSAMPLING = {"resize": RESIZE, "transposed": TRANSPOSED}
-
-
-def _pad(x, before: int, after: int):
-    return jnp.pad(x, ((0, 0), (before, after), (before, after), (0, 0)))
 
 
 def _valid(x, kernel):
@@ -54,7 +51,7 @@ def _kernel_slope_products(x, kernel, slope):
     """
     k, _, ins, outs = kernel.shape
     swapped = outs < ins
-    still, moving = (x, _pad(slope, k - 1, k - 1)) if swapped else (slope, x)
+    still, moving = (x, pad(slope, k - 1, k - 1)) if swapped else (slope, x)
     n, h, w, _ = still.shape
     channels = moving.shape[3]
     turned = still.reshape(n * h * w, -1).T
@@ -86,9 +83,15 @@ def _kernel_slope_products(x, kernel, slope):
     return slopes.reshape(kernel.shape).astype(kernel.dtype)
 
 
+FEW = (8, 16)
+"""Least and most output channels for which XLA's own slope of the kernel takes a CPU 0.2 to 0.8 of
+the time of products of matrices, at 8 to 64 input channels (about the same at 2 to 5, and at 128 up
+to 1.0); with 1 or 64 it takes up to five times as long."""
+
+
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _convolve(x, kernel, padding):
-    return _valid(_pad(x, *padding), kernel)
+    return _valid(pad(x, *padding), kernel)
 
 
 def _forward(x, kernel, padding):
@@ -99,33 +102,30 @@ def _picture_slope(kernel, slope, padding):
     """As a convolution of the slope, of what lies on the picture alone: autodiff computes the
     slope of the padding, too, and throws it away, a fifth of the products of 32 x 32 pixels."""
     edge = kernel.shape[0] - 1
-    around = _pad(slope, edge - padding[0], edge - padding[1])
+    around = pad(slope, edge - padding[0], edge - padding[1])
     return _valid(around, kernel[::-1, ::-1].swapaxes(2, 3))
 
 
 def _backward(padding, saved, slope):
     x, kernel = saved
     to_x = _picture_slope(kernel, slope, padding)
-    few = FEW[0] <= kernel.shape[3] <= FEW[1]
-    found = _kernel_slope if few else _kernel_slope_products
-    to_kernel = lax.platform_dependent(
-        _pad(x, *padding), kernel, slope, cpu=found, default=_kernel_slope
+    x = pad(x, *padding)
+    if FEW[0] <= kernel.shape[3] <= FEW[1]:
+        return to_x, _kernel_slope(x, kernel, slope)
+    return to_x, lax.platform_dependent(
+        x, kernel, slope, cpu=_kernel_slope_products, default=_kernel_slope
     )
-    return to_x, to_kernel
 
 
 _convolve.defvjp(_forward, _backward)
 
-FEW = (8, 16)
-"""Numbers of output channels for which XLA's own slope of the kernel takes 0.2 to 0.8 of the time
-of products of matrices, at 5 to 128 input channels; for others up to five times as long."""
 WIDE = 128
 """Channels on both sides from which fewer products pay for the sums that they take."""
 
 
 @functools.partial(jax.custom_vjp, nondiff_argnums=(2,))
 def _convolve_wide(x, kernel, padding):
-    return lax.platform_dependent(_pad(x, *padding), kernel, cpu=winograd.convolve, default=_valid)
+    return lax.platform_dependent(pad(x, *padding), kernel, cpu=winograd.convolve, default=_valid)
 
 
 def _forward_wide(x, kernel, padding):
@@ -135,7 +135,7 @@ def _forward_wide(x, kernel, padding):
 def _backward_wide(padding, saved, slope):
     def plain(x, kernel, slope):
         to_x = _picture_slope(kernel, slope, padding)
-        return to_x, _kernel_slope(_pad(x, *padding), kernel, slope)
+        return to_x, _kernel_slope(pad(x, *padding), kernel, slope)
 
     def fewer(x, kernel, slope):
         return winograd.slopes(x, kernel, slope, padding)
@@ -191,7 +191,7 @@ def convolve(x, kernel, stride: int = 1, fast: bool = False):
         )
     ins, outs = kernel.shape[2:]
     blocks = kernel.reshape(2, 2, 2, 2 * ins, outs).transpose(0, 2, 1, 3, 4)
-    return _dense(blocks_to_channels(_pad(x, 1, 1)), blocks.reshape(2, 2, 4 * ins, outs), (0, 0))
+    return _dense(blocks_to_channels(pad(x, 1, 1)), blocks.reshape(2, 2, 4 * ins, outs), (0, 0))
 
 
 def convolve_up(x, kernel, upsampling: str = "resize", fast: bool = False):

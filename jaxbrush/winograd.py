@@ -66,6 +66,11 @@ def _every(x, begin, count):
     return x[:, y : y + TILE * (rows - 1) + 1 : TILE, x0 : x0 + TILE * (columns - 1) + 1 : TILE]
 
 
+def pad(x, before: int, after: int):
+    """x (n, h, w, c) with zeros around, as many on both axes."""
+    return jnp.pad(x, ((0, 0), (before, after), (before, after), (0, 0)))
+
+
 def _tiles(shape, side):
     return -(-(shape[1] - side + 1) // TILE), -(-(shape[2] - side + 1) // TILE)
 
@@ -140,10 +145,6 @@ def slopes(x, kernel, slope, padding):
     """
     edge = kernel.shape[0] - 1
     before, after = padding
-    around = _pad(slope, edge - before, edge - after)
+    around = pad(slope, edge - before, edge - after)
     to_x = convolve(around, kernel[::-1, ::-1].swapaxes(2, 3))
-    return to_x, _kernel_slope(_pad(x, before, after), slope, kernel.shape[0])
-
-
-def _pad(x, before, after):
-    return jnp.pad(x, ((0, 0), (before, after), (before, after), (0, 0)))
+    return to_x, _kernel_slope(pad(x, before, after), slope, kernel.shape[0])

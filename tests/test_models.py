@@ -89,6 +89,14 @@ def test_slope_of_a_kernel_by_products_of_matrices(ins, outs, side):
     np.testing.assert_allclose(found, c._kernel_slope(x, kernel, slope), atol=1e-4)
 
 
+@pytest.mark.parametrize(("outs", "products"), [(5, 1), *((n, 0) for n in FEW), (17, 1)])
+def test_slopes_of_kernels_with_few_outputs_are_left_to_convolutions(outs, products):
+    """By products of matrices they take up to five times as long."""
+    x, kernel = drawn(1, 8, 8, 9), drawn(4, 4, 9, outs, seed=1)
+    slope = jax.make_jaxpr(jax.grad(lambda k: jnp.sum(convolve(x, k) ** 2)))(kernel)
+    assert (" dot_general[" in str(slope)) == bool(products)
+
+
 def test_the_slope_of_a_picture_is_not_computed_on_its_padding():
     """Plain autodiff computes it there, too: (19 / 16)^2 as many pixels, and throws them away."""
     x, kernel, slope = drawn(1, 16, 16, 32), drawn(4, 4, 32, 32), drawn(1, 16, 16, 32, seed=1)
