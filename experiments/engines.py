@@ -167,7 +167,7 @@ class Simulator:
         self.inside = tuple(slice(self.margin, self.margin + n) for n in inner)
         size = tuple(n + 2 * self.margin for n in inner)
         self.paint_canvas = empty_canvas(self.config, size)
-        self.tooth = jnp.asarray(weave(size, config.pixel), float)
+        self.tooth = weave(size, config.pixel)
         self._move, self._lay = jax.jit(_moved, static_argnums=3), jax.jit(paint_stroke)
 
     def paint(self, deed: Deed) -> dict[str, float]:

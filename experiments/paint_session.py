@@ -75,7 +75,7 @@ def save(path: Path, image: np.ndarray) -> None:
 
 def lit(canvas: Canvas) -> np.ndarray:
     """The canvas under a lamp, 8-bit RGB."""
-    cloth = jnp.asarray(weave(canvas.height.shape, engines.PIXEL), float)
+    cloth = weave(canvas.height.shape, engines.PIXEL)
     return np.asarray(picture(shade(canvas, engines.PIXEL, weave=cloth)))
 
 

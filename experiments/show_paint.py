@@ -64,7 +64,7 @@ def total(config: PaintConfig, canvas, brush) -> float:
 def cloth(config: PaintConfig, name: str):
     """Weave (y, x) of a sheet [mm]."""
     relief = {"depth": RELIEF[name]} if name in RELIEF else {}
-    return jnp.asarray(weave(SHAPE, config.pixel, **relief), float)
+    return weave(SHAPE, config.pixel, **relief)
 
 
 def paint(config: PaintConfig, spacing: float, touches, name: str):

@@ -17,12 +17,14 @@ between the hairs is up to the flow: paint gathers where there is little hair. S
 the hair in the film is kept beside it, averaged over the last of the way.
 """
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.paint.state import TUNED_HAIRS, make_params
+from jaxbrush.paint.state import RELIEF, TUNED_HAIRS, make_params, weave
 from jaxbrush.patches import cut_canvas
 from jaxbrush.raster import Grid
 from jaxbrush.structs import state
@@ -46,6 +48,8 @@ STANDS = 0.5
 """Share of the film in equilibrium that is not taken along. If all of it stands, a stroke on bare
 canvas has no ridge at its end, and networks have some 2 % more error; if none does, it is as with
 half, but the film trembles more with the stamps."""
+FULL = 1.3
+"""Times what a tip holds, up to which its coat grows, as in the simulator."""
 LIFTED = 0.5
 """Rate at which hair takes paint out of a film that is too thick, as a share of that at which it
 lays. These four were chosen among a dozen by the error of networks after 1,000 updates, on the 112
@@ -56,15 +60,31 @@ test pairs of docs/networks.md."""
 class Laid:
     """What a stroke has laid so far. film: (h, w) height of the paint [mm]. hair: (h, w) volume of
     hair below the film's surface over the pixel's area [mm], averaged over the last `MEMORY` of the
-    way of hair through the pixel. taken: (b,) what each bristle takes along, as a height over a
-    pixel [mm]."""
+    way of hair through the pixel. Of each bristle (b,), as heights over a pixel [mm]: taken, what
+    it takes along; tip and behind, what it holds there and in the brush behind."""
 
     film: jax.Array
     hair: jax.Array
     taken: jax.Array
+    tip: jax.Array
+    behind: jax.Array
 
 
-def laid_film(grid: Grid, track: BristleTrack, hairs, load, height):
+def dipped(pixel: float, hairs, load, laid: Laid) -> Laid:
+    """A film with bristles that hold what a brush was loaded with and take nothing along; arguments
+    as in `laid_film`."""
+    most, least = (load * x for x in _holds(pixel, hairs))
+    none = jnp.zeros_like(laid.tip)
+    return dataclasses.replace(laid, taken=none, tip=none + most, behind=none + least)
+
+
+def _holds(pixel: float, hairs):
+    """What a bristle holds at its tip and behind, as heights over a pixel [mm]."""
+    p = make_params()
+    return [hairs * x / (TUNED_HAIRS * pixel**2) for x in (p.tip_volume, p.reservoir_volume)]
+
+
+def laid_film(grid: Grid, track: BristleTrack, hairs, load, height, relief=RELIEF):
     """Height of the paint after a stroke that lays it, lifts it and takes it along, on the pixels
     of a grid, and the hair that was in it last.
 
@@ -76,7 +96,7 @@ def laid_film(grid: Grid, track: BristleTrack, hairs, load, height):
       grid: its origin on whole pixels of the canvas. track: of t stamps about a pixel apart, at
         least 2 nodes and b bristles. hairs: () of the simulator's constants that a bristle stands
         for. load: () share of what the brush holds. height: (y, x) of the canvas before [mm], which
-        goes on beyond its edges as it is there.
+        goes on beyond its edges as it is there. relief: () depth of its weave [mm].
 
     Returns:
       (film, hair) of `Laid`.
@@ -85,8 +105,9 @@ def laid_film(grid: Grid, track: BristleTrack, hairs, load, height):
       ValueError: a track of the tips alone.
     """
     bare = cut_canvas(height, _corner(grid)[None], grid.shape)[0]
-    begun = Laid(bare, jnp.zeros_like(bare), jnp.zeros(track.position.shape[-1], bare.dtype))
-    laid = lay_on(grid, track, hairs, load, height.shape, begun)
+    each = jnp.zeros(track.position.shape[-1], bare.dtype)
+    begun = dipped(grid.pixel, hairs, load, Laid(bare, jnp.zeros_like(bare), each, each, each))
+    laid = lay_on(grid, track, hairs, height.shape, begun, relief)
     return laid.film, laid.hair
 
 
@@ -113,17 +134,22 @@ def _meet_jvp(primals, tangents):
     return _meet(*primals), (zero, zero.at[cell].add(tangents[3])[cell])
 
 
-def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> Laid:
+def lay_on(
+    grid: Grid, track: BristleTrack, hairs, canvas, laid: Laid, relief=RELIEF
+) -> Laid:  # fmt: skip
     """Goes on with the film of a stroke; arguments as in `laid_film`, but track: its next stamps,
     the first of which only says where the hair was. canvas: (y, x) its size, static. laid: so far,
-    on the pixels of the grid."""
+    on the pixels of the grid, at first from `dipped`."""
     if track.position.shape[1] < 2:
         raise ValueError(f"track of {track.position.shape[1]} node: expected at least 2")
     p, pixel = make_params(), grid.pixel
-    radius, coat = p.hair_radius, p.hair_radius * (p.coat_dry + p.coat_full * load)
-    reach, stands = radius + coat, STANDS * jnp.maximum(0.7 * coat - radius, 0.0)
+    radius = p.hair_radius
+    most, most_behind = _holds(pixel, hairs)
     h, w = grid.shape
     corner = _corner(grid)
+    # How far below what hair lies on the cloth is.
+    gap = relief - weave(grid.shape, pixel, relief, first=(corner[0], corner[1]))
+    gap = jnp.append(gap.reshape(-1), 0.0).astype(laid.film.dtype)
     film = jnp.append(laid.film.reshape(-1), 0.0)  # the last: off the grid
     hair = jnp.append(laid.hair.reshape(-1), 0.0)
 
@@ -154,14 +180,19 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
     falls = 1.0 - jnp.exp(-way / BEHIND) * jnp.sum(piece * stays, axis=1)
     place = points[:, :2] / pixel - 0.5
     low = jnp.floor(place)
-    place, high = place - low, jnp.maximum(points[:, 2], 0.0)
+    place, high = place - low, jnp.maximum(points[:, 2] - relief, 0.0)
     first = low[:, ::-1].astype(jnp.int32) - corner[None, :, None, None]
     size = jnp.asarray([h, w], jnp.int32)[None, :, None, None]
     near = jnp.any(jnp.all((first >= -1) & (first < size), axis=1), axis=(1, 2))
-    near = near & track.valid & jnp.any(high < reach + jnp.max(film), axis=(1, 2))
+    furthest = radius * (1.0 + p.coat_dry + FULL * p.coat_full) + jnp.max(film)
+    near = near & track.valid & jnp.any(high < furthest, axis=(1, 2))
+    refill = 1.0 - jnp.exp(-p.refill * way)
 
     def pass_over(carry, first, place, high, each, kept, wake, falls):
-        film, hair, taken, heap, last = carry
+        film, hair, taken, tip, heap, last = carry
+        full = jnp.minimum(tip / most, FULL)[None, None]
+        coat = radius * (p.coat_dry + p.coat_full * full)
+        reach, stands = radius + coat, STANDS * jnp.maximum(0.7 * coat - radius, 0.0)
         cells, shares, moving = [], [], []
         for dy in (0, 1):
             for dx in (0, 1):
@@ -175,21 +206,25 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
                 y, x = y + corner[0], x + corner[1]
                 moving.append(inside & (y >= 0) & (y < canvas[0]) & (x >= 0) & (x < canvas[1]))
         cell = jnp.stack(cells)
-        under = film[cell]
+        under, gap_there = film[cell], gap[cell]
         touch = jnp.clip((reach - (high[None] - under)) / reach, 0.0, 1.0)
+        # A coat bridges gaps between threads only as far as it is thick.
+        touch = touch * (1.0 - jnp.clip((gap_there - under) / coat, 0.0, 1.0))
+        above = high[None] + gap_there
         share = jnp.stack(shares)
         there = share * touch * each[None]
-        even = jnp.maximum(high + 0.7 * coat - radius, 0.0)[None]
-        sunk = jnp.clip((under - high[None]) / (2.0 * radius) + 0.5, 0.0, 1.0)
+        even = jnp.maximum(above + 0.7 * coat - radius, 0.0)
+        sunk = jnp.clip((under - above) / (2.0 * radius) + 0.5, 0.0, 1.0)
         within = share * volume * sunk
-        moves = jnp.where(jnp.stack(moving), share, 0.0)
+        on = jnp.stack(moving)
+        moves = jnp.where(on, share, 0.0)
         swept = moves * wake[None] * sunk
         # All along the hair, ahead of its tip, while any of it touches.
         lets = jnp.minimum(jnp.sum(moves * touch, axis=(0, 1)), 1.0)
         left = moves * piece * (lets * falls * taken)[None, None]
         sums = jnp.stack([there, there * even, within, swept], axis=-1)
         heap, sums = _meet(jax.lax.stop_gradient(heap), last, cell, sums)
-        met, drawn, full, wide = (sums[..., k] for k in range(4))
+        met, drawn, filled, wide = (sums[..., k] for k in range(4))
         some = jnp.where(met > 0.0, met, 1.0)
         wanted = drawn / some - under
         wanted = jnp.where(wanted < 0.0, LIFTED * wanted, wanted)
@@ -198,27 +233,42 @@ def lay_on(grid: Grid, track: BristleTrack, hairs, load, canvas, laid: Laid) -> 
         some_wide = wide > 1e-3
         part = (1.0 - jnp.exp(-wide)) / jnp.where(some_wide, wide, 1.0)
         part = jnp.where(some_wide, part, 1.0 - 0.5 * wide)
-        new = part * swept * jnp.maximum(under - high[None] - stands, 0.0)
-        comes = (1.0 - kept) * (full - hair[cell]) / jnp.where(full > 0.0, full, 1.0)
-        new_film, new_hair = there / some * change + left - new, within * comes
+        new = part * swept * jnp.maximum(under - above - stands, 0.0)
+        comes = (1.0 - kept) * (filled - hair[cell]) / jnp.where(filled > 0.0, filled, 1.0)
+        # A dry bristle gives less, and none more than half of what it holds.
+        gives = there / some * change
+        gives = jnp.where(gives > 0.0, gives * jnp.minimum(2.0 * full, 1.0), gives)
+        given = jnp.sum(jnp.where(on, jnp.maximum(gives, 0.0), 0.0), axis=(0, 1))
+        enough = given <= 0.5 * tip
+        limit = jnp.where(enough, 1.0, 0.5 * tip / jnp.where(enough, 1.0, given))
+        gives = jnp.where(gives > 0.0, gives * limit[None, None], gives)
+        new_film, new_hair = gives + left - new, within * comes
         taken = taken + jnp.sum(new - left, axis=(0, 1))
-        return new_film, new_hair, taken, jax.lax.stop_gradient(heap), cell
+        tip = tip - jnp.sum(jnp.where(on, gives, 0.0), axis=(0, 1))
+        return new_film, new_hair, taken, tip, jax.lax.stop_gradient(heap), cell
 
     def step(carry, inputs):
-        near, *rest = inputs
-        film, hair, *others = carry
+        near, refill, *rest = inputs
+        film, hair, taken, tip, behind, *others = carry
         # Added here and not in the branch: XLA's CPU back end would work out what is scattered one
         # number at a time.
-        *new, taken, heap, cell = jax.lax.cond(
-            near, pass_over, lambda *_: (none, none, *others), carry, *rest
+        *new, taken, tip, heap, cell = jax.lax.cond(
+            near,
+            pass_over,
+            lambda carry, *_: (none, none, *carry[2:]),
+            (film, hair, taken, tip, *others),
+            *rest,
         )
         film, hair = (x.at[cell].add(more) for x, more in zip((film, hair), new, strict=True))
-        return (film, hair, taken, heap, cell), None
+        # As in the simulator (`paint.transfer.refill`).
+        down = refill * jnp.maximum(most - tip, 0.0) * jnp.clip(behind / (0.3 * most_behind), 0, 1)
+        down = jnp.minimum(down, 0.9 * behind) - 0.5 * jnp.maximum(tip - 1.8 * most, 0.0)
+        return (film, hair, taken, tip + down, behind - down, heap, cell), None
 
-    stamps = near, first, place, high, each, kept, wake, falls
+    stamps = near, refill, first, place, high, each, kept, wake, falls
     heap = jnp.zeros((film.size, 4), film.dtype)
     last = jnp.full((4, *points.shape[2:]), h * w, jnp.int32)
     none = jnp.zeros(last.shape, film.dtype)
-    start = film, hair, laid.taken, heap, last
-    (film, hair, taken, *_), _ = jax.lax.scan(step, start, stamps)
-    return Laid(film[:-1].reshape(h, w), hair[:-1].reshape(h, w), taken)
+    start = film, hair, laid.taken, laid.tip, laid.behind, heap, last
+    (film, hair, *each, _, _), _ = jax.lax.scan(step, start, stamps)
+    return Laid(film[:-1].reshape(h, w), hair[:-1].reshape(h, w), *each)

@@ -6,6 +6,7 @@ i // strokes, so it depends on (config, seed, i) only.
 """
 
 import dataclasses
+import functools
 
 import jax
 import jax.numpy as jnp
@@ -15,6 +16,7 @@ from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, make_brush, r
 from jaxbrush.canvas import Canvas, flatten, from_srgb, to_srgb
 from jaxbrush.film import laid_film
 from jaxbrush.paint import (
+    RELIEF,
     BrushPaint,
     PaintConfig,
     PaintParams,
@@ -39,6 +41,8 @@ MARGIN = 32
 """Pixels of canvas around what is kept, so that a stroke over its edge piles nothing up there."""
 LOAD = 0.85
 """Share of what a brush holds that it is loaded with, where nothing else is said."""
+DRY = 0.15
+"""Share of strokes with a brush that holds next to nothing."""
 REACH = 8
 """Pixels beyond the bristles that a stroke may change: how far the mask is dilated."""
 
@@ -49,8 +53,8 @@ class PairConfig:
     beside: every so many-th canvas is painted side by side (`draw_beside`), 0 is none. stamps: of
     a stroke at most; longer ones are made smaller. way: of strokes that are not side by side, at
     most, also so [mm]. spacing: of the stamps that are painted [mm], a pixel or a whole part of
-    it; maps are drawn a pixel apart, as in use. bristles: simulated. paint, brush: the
-    simulators."""
+    it; maps are drawn a pixel apart, as in use. bristles: simulated. relief: of every other canvas
+    at most, others have the usual one [mm]. paint, brush: the simulators."""
 
     size: int = 128
     strokes: int = 4
@@ -59,6 +63,7 @@ class PairConfig:
     way: float = 19.0
     spacing: float = 0.0625
     bristles: int = 128
+    relief: float = 0.1
     paint: PaintConfig = PaintConfig(window=48, solver="chebyshev")  # noqa: RUF009
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
 
@@ -71,6 +76,8 @@ class PairConfig:
                 f"PairConfig.spacing = {self.spacing}: expected the pixel, {self.paint.pixel} mm, "
                 "or a whole part of it"
             )
+        if not self.relief >= RELIEF:
+            raise ValueError(f"PairConfig.relief = {self.relief}: expected >= {RELIEF} mm")
         if not self.way > 0.0:
             raise ValueError(f"PairConfig.way = {self.way}: expected > 0 mm")
         if self.size < self.paint.window or self.size % 4:
@@ -127,6 +134,7 @@ class Picture:
     reached: jax.Array
 
 
+@functools.partial(jax.jit, static_argnums=1)
 def draw_palette(key, pigments: int):
     """(k, 3) linear RGB as a painter squeezes them out: whites, earths, a few strong colors."""
     hue, chroma, value = jax.random.uniform(key, (3, pigments))
@@ -154,6 +162,7 @@ def _placed(options: PairConfig, stroke: Stroke, depth, most, place, rotate):
     return resample(stroke, options.stamps, options.spacing, np.inf, depth)
 
 
+@jax.jit
 def _draw_stroke(options: PairConfig, key, depth):
     """A stroke that fits the canvas, turned at random; it may leave the canvas."""
     own, turn, shift = jax.random.split(key, 3)
@@ -166,8 +175,13 @@ def _draw_stroke(options: PairConfig, key, depth):
 
 def _draw_brush(options: PairConfig, key):
     """The brush of `draw`: its params, those of its paint, and its width [mm]."""
-    shape, size, hair, *_ = jax.random.split(key, 6)
-    name = SHAPES[int(jax.random.randint(shape, (), 0, len(SHAPES)))]
+    shape, *_ = jax.random.split(key, 6)
+    return _make_brush(options, SHAPES[int(jax.random.randint(shape, (), 0, len(SHAPES)))], key)
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _make_brush(options: PairConfig, name: str, key):
+    _, size, hair, *_ = jax.random.split(key, 6)
     low, high = (1.4, 2.8) if name == "round" else (1.8, 4.0)
     width = jax.random.uniform(size, (), minval=low, maxval=high)
     thickness = width if name == "round" else jnp.maximum(0.7, 0.3 * width)
@@ -180,6 +194,7 @@ def _draw_brush(options: PairConfig, key):
     return brush, for_brush(make_params(), width, thickness, options.bristles, disc), width
 
 
+@jax.jit
 def _draw_load(options: PairConfig, key):
     """The mix and the load of `draw`, as `Plan` has them."""
     *_, color, load = jax.random.split(key, 6)
@@ -189,10 +204,12 @@ def _draw_load(options: PairConfig, key):
     )
     # Every third stroke is mixed from two.
     share = jnp.maximum(0.0, jax.random.uniform(blend, (), minval=-1.0, maxval=0.5))
-    # Mostly full, some nearly dry.
+    # Mostly full, some so dry that they catch on a coarse weave.
+    full = 1.0 - 0.75 * jax.random.uniform(load, ()) ** 2
+    choice, least = jax.random.uniform(jax.random.fold_in(load, 1), (2,))
     return (
         (1.0 - share) * pick(first) + share * pick(second),
-        1.0 - 0.75 * jax.random.uniform(load, ()) ** 2,
+        jnp.where(choice < DRY, 0.05 + 0.2 * least, full),
     )
 
 
@@ -218,6 +235,14 @@ def draw_beside(options: PairConfig, key, number: int) -> Plan:
     """
     own = jax.random.fold_in(key, number + 1)
     brush, paint, width = _draw_brush(options, jax.random.fold_in(key, 1))
+    stroke = _draw_beside(options, key, own, number, width, brush.press_depth)
+    mix, load = _draw_load(options, own)
+    return Plan(stroke=stroke, brush=brush, paint=paint, mix=mix, load=load)
+
+
+@jax.jit
+def _draw_beside(options: PairConfig, key, own, number, width, depth):
+    """The stroke of `draw_beside`."""
     path, layout = jax.random.split(jax.random.fold_in(key, options.strokes + 1))
     choice, gap, to_and_fro, *place = jax.random.uniform(layout, (5,))
     along, aside = jax.random.uniform(jax.random.fold_in(own, 0), (2,), minval=-0.1, maxval=0.1)
@@ -240,30 +265,31 @@ def draw_beside(options: PairConfig, key, number: int) -> Plan:
         # Its broad side ahead, more or less.
         twist=jnp.arctan2(chord[1], chord[0]) + 0.5 * np.pi + 0.4 * stroke.twist,
     )
-    stroke = _placed(options, stroke, brush.press_depth, np.inf, middle, 0.0)
-    mix, load = _draw_load(options, own)
-    return Plan(stroke=stroke, brush=brush, paint=paint, mix=mix, load=load)
+    return _placed(options, stroke, depth, np.inf, middle, 0.0)
 
 
 @state
 class Loaded(BristleTrack):
     """The track of a loaded brush. hairs: (t,) of the simulator's paint constants that a bristle
     stands for, of `TUNED_HAIRS` on `TUNED_AREA`: what it lays where it sweeps goes with them. load:
-    (t,) share of what it holds that the brush was loaded with."""
+    (t,) share of what it holds that the brush was loaded with. relief: (t,) depth of the weave
+    [mm]."""
 
     hairs: jax.Array
     load: jax.Array
+    relief: jax.Array
 
 
-def loaded(track: BristleTrack, brush: BrushParams, load=LOAD, coat: float = COAT) -> Loaded:
+def loaded(track: BristleTrack, brush: BrushParams, load=LOAD, relief=RELIEF) -> Loaded:
     """The track as maps of a loaded brush see it: a bristle touches where its coat of paint does,
-    `coat` [mm] above the canvas, there without force."""
-    near = (track.position[:, :, 2] < coat) & track.valid[:, None, None]
+    `COAT` above the canvas, there without force."""
+    near = (track.position[:, :, 2] < COAT) & track.valid[:, None, None]
     own = {f.name: getattr(track, f.name) for f in dataclasses.fields(track)}
     own["force"] = jnp.where(near, jnp.maximum(track.force, 1e-3), 0.0)
     each = brush.area / track.position.shape[-1] * np.float32(TUNED_HAIRS / TUNED_AREA)
     every = jnp.ones_like(track.time)
-    return Loaded(**own, hairs=each * every, load=jnp.asarray(load, float) * every)
+    load, relief = jnp.asarray(load, float) * every, jnp.asarray(relief, float) * every
+    return Loaded(**own, hairs=each * every, load=load, relief=relief)
 
 
 def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None, laid=None):
@@ -286,7 +312,8 @@ def drawn_maps(grid: Grid, track: Loaded, canvas: Canvas, color, edge=None, laid
     maps = trajectory_maps(grid, track, carried, edge=edge)
     end = jnp.max(jnp.where(track.valid, track.time, 0.0))
     if laid is None:
-        laid = laid_film(grid, track, track.hairs[0], track.load[0], canvas.height)
+        one = track.hairs[0], track.load[0]
+        laid = laid_film(grid, track, *one, canvas.height, track.relief[0])
     film, hair = laid
     return {
         "pressure": maps.pressure,
@@ -315,11 +342,12 @@ def on_way(track: BristleTrack, stroke: Stroke, depth) -> BristleTrack:
     return dataclasses.replace(track, time=way(stroke, depth))
 
 
-def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
+def paint_pair(options: PairConfig, plan: Plan, palette, relief, canvas):
     """Paints one stroke of a plan. Pure; jit and vmap it.
 
     Args:
-      canvas, tooth: with `MARGIN` pixels more on each side than the pair keeps.
+      relief: () depth of the canvas's weave [mm]. canvas: with `MARGIN` pixels more on each side
+        than the pair keeps.
 
     Returns:
       (canvas after (z, k, y, x), Picture).
@@ -331,6 +359,7 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
     dipped: BrushPaint = load_brush(
         options.paint, plan.paint, options.bristles, plan.load, plan.mix
     )
+    tooth = weave(canvas.shape[2:], options.paint.pixel, relief, first=(-MARGIN, -MARGIN))
     after, _, report = paint_stroke(options.paint, plan.paint, canvas, dipped, moved, tooth)
     kept = slice(MARGIN, MARGIN + options.size)
     seen = lambda c: flatten(  # noqa: E731
@@ -342,7 +371,7 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
         thick, options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
     ).color[0, 0]
     grid = make_grid((options.size, options.size), pixel=options.paint.pixel)
-    drawn = on_way(loaded(track, plan.brush, plan.load), plan.stroke, plan.brush.press_depth)
+    drawn = on_way(loaded(track, plan.brush, plan.load, relief), plan.stroke, plan.brush.press_depth)
     drawn = jax.tree.map(lambda x: x[:: options.every], drawn)
     before, now = seen(canvas), seen(after)
     told, maps = drawn_maps(grid, drawn, before, own)
@@ -358,19 +387,21 @@ def paint_pair(options: PairConfig, plan: Plan, palette, canvas, tooth):
 
 
 _paint_pair = jax.jit(paint_pair)
-_paint_pairs = jax.jit(jax.vmap(paint_pair, in_axes=(None, 0, 0, 0, None)))
+_paint_pairs = jax.jit(jax.vmap(paint_pair, in_axes=(None, 0, 0, 0, 0)))
 
 
 def _begun(options: PairConfig, seed: int, number: int):
-    """Palette of a canvas, and `plan(stroke)` of its strokes."""
+    """Palette of a canvas, the relief of its weave, and `plan(stroke)` of its strokes."""
     key = jax.random.fold_in(jax.random.key(seed), number)
+    deep = jax.random.uniform(jax.random.fold_in(key, options.strokes + 2), (), minval=-1.0)
+    relief = RELIEF + (options.relief - RELIEF) * jnp.maximum(deep, 0.0)
 
     def plan(stroke: int) -> Plan:
         if options.beside and number % options.beside == options.beside - 1:
             return draw_beside(options, key, stroke)
         return draw(options, jax.random.fold_in(key, stroke + 1))
 
-    return draw_palette(jax.random.fold_in(key, 0), options.paint.pigments), plan
+    return draw_palette(jax.random.fold_in(key, 0), options.paint.pigments), relief, plan
 
 
 def canvas_pairs(options: PairConfig, seed: int, number: int):
@@ -382,12 +413,11 @@ def canvas_pairs(options: PairConfig, seed: int, number: int):
     Returns:
       list of `strokes` Pictures, numpy arrays.
     """
-    palette, plan = _begun(options, seed, number)
+    palette, relief, plan = _begun(options, seed, number)
     shape = (options.size + 2 * MARGIN,) * 2
-    tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
     canvas, pictures = empty_canvas(options.paint, shape), []
     for stroke in range(options.strokes):
-        canvas, picture = _paint_pair(options, plan(stroke), palette, canvas, tooth)
+        canvas, picture = _paint_pair(options, plan(stroke), palette, relief, canvas)
         pictures.append(jax.tree.map(np.asarray, picture))
     return pictures
 
@@ -395,14 +425,14 @@ def canvas_pairs(options: PairConfig, seed: int, number: int):
 def canvases_pairs(options: PairConfig, seed: int, numbers):
     """`canvas_pairs` of several canvases, a list for each, painted side by side: for a GPU, which
     one canvas does not fill. The same but for rounding, which moves single grooves."""
-    palettes, plans = zip(*(_begun(options, seed, n) for n in numbers), strict=True)
+    palettes, reliefs, plans = zip(*(_begun(options, seed, n) for n in numbers), strict=True)
     shape = (options.size + 2 * MARGIN,) * 2
-    tooth = jnp.asarray(weave(shape, options.paint.pixel), float)
     stacked = lambda trees: jax.tree.map(lambda *x: jnp.stack(x), *trees)  # noqa: E731
     canvas, palette = stacked([empty_canvas(options.paint, shape)] * len(plans)), stacked(palettes)
+    reliefs = jnp.stack(reliefs)
     strokes = []
     for stroke in range(options.strokes):
         drawn = stacked([plan(stroke) for plan in plans])
-        canvas, picture = _paint_pairs(options, drawn, palette, canvas, tooth)
+        canvas, picture = _paint_pairs(options, drawn, palette, reliefs, canvas)
         strokes.append(jax.device_get(picture))
     return [[jax.tree.map(lambda x, k=k: x[k], p) for p in strokes] for k in range(len(plans))]

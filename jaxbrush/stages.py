@@ -22,6 +22,7 @@ from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, rollout
 from jaxbrush.canvas import Canvas, from_srgb, to_srgb
 from jaxbrush.metrics import image_scale
 from jaxbrush.models import Generator, GeneratorConfig
+from jaxbrush.paint import RELIEF
 from jaxbrush.pairs import LOAD, REACH, Loaded, drawn_maps, loaded, on_way
 from jaxbrush.patches import Box, Layout, PatchConfig, Rect
 from jaxbrush.raster import WIDTH, dilate
@@ -38,8 +39,8 @@ NOWHERE = 1e9
 class PainterConfig:
     """Static choices.
 
-    pixel: side of a pixel of the canvas [mm], that of the training pairs. brush: how bristles are
-    simulated. patches: how a stroke is cut. blend: how patches become one picture, one of BLENDS.
+    pixel: side of a pixel of the canvas [mm], that of the training pairs. relief: depth of its
+    weave [mm], on one of some 0.09 a dry brush catches. brush: how bristles are simulated. patches: how a stroke is cut. blend: how patches become one picture, one of BLENDS.
     moments: "patch", each normalised by its own moments; or "stroke", by those of all of its
     stroke, which are then painted at once and show no seam side by side ("cut"). edge: of soft maps
     [mm], or None for exact ones. stamps: buckets of stamps; a stroke that needs more gets the most,
@@ -50,6 +51,7 @@ class PainterConfig:
     """
 
     pixel: float = 0.125
+    relief: float = RELIEF
     brush: BrushConfig = BrushConfig()  # noqa: RUF009
     patches: PatchConfig = PatchConfig()  # noqa: RUF009
     blend: str = "cut"
@@ -150,7 +152,7 @@ def place_stamps(options: PainterConfig, brush: BrushParams, stroke: Stroke, sta
 
 def trace(options: PainterConfig, brush: BrushParams, stroke: Stroke, load=LOAD) -> Loaded:
     """Moves a loaded brush along the stamps of a stroke; the track's clock is the way [mm]."""
-    track = loaded(rollout(options.brush, brush, stroke), brush, load)
+    track = loaded(rollout(options.brush, brush, stroke), brush, load, options.relief)
     return on_steps(options, on_way(track, stroke, brush.press_depth))
 
 

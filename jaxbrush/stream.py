@@ -14,7 +14,7 @@ import numpy as np
 
 from jaxbrush import painter, patches, stages
 from jaxbrush.canvas import Canvas
-from jaxbrush.film import Laid, lay_on
+from jaxbrush.film import Laid, dipped, lay_on
 from jaxbrush.painter import Nets, PainterConfig
 from jaxbrush.pairs import REACH
 from jaxbrush.patches import PatchConfig, Rect
@@ -55,21 +55,23 @@ _paint = jax.jit(_core)
 @functools.partial(jax.jit, static_argnums=(0, 1))
 def _lay_on(pixel, canvas, corner, track, laid: Laid) -> Laid:
     grid = patches.grid_of(PATCHES, Rect(corner=corner, sides=laid.film.shape), pixel)
-    return lay_on(grid, track, track.hairs[0], track.load[0], canvas, laid)
+    return lay_on(grid, track, track.hairs[0], canvas, laid, track.relief[0])
 
 
 class Film:
     """The film of a stroke that goes on, on all of the canvas and `BORDER` around it.
 
     Args:
-      height: of the canvas before [mm].
+      height: of the canvas before [mm]. track: of some of its stamps, from `stages.trace`.
     """
 
-    def __init__(self, pixel: float, height, bristles: int):
+    def __init__(self, pixel: float, height, track):
         self.pixel, self.canvas = pixel, height.shape
         self.film = np.pad(np.asarray(height), BORDER, mode="edge")
         self.hair = np.zeros_like(self.film)
-        self.taken = np.zeros(bristles, self.film.dtype)
+        none = np.zeros(track.position.shape[-1], self.film.dtype)
+        laid = Laid(film=self.film, hair=self.hair, taken=none, tip=none, behind=none)
+        self.laid = jax.device_get(dipped(pixel, track.hairs[0], track.load[0], laid))
 
     def add(self, track):
         """Goes on with the next stamps; the first is the last one of before, if there was one."""
@@ -83,9 +85,9 @@ class Film:
         sides = np.minimum(sides, self.film.shape)
         at = np.clip(low, -BORDER, end - sides)
         here = self._here(at, sides)
-        laid = Laid(film=self.film[here], hair=self.hair[here], taken=self.taken)
+        laid = dataclasses.replace(self.laid, film=self.film[here], hair=self.hair[here])
         laid = jax.device_get(_lay_on(self.pixel, self.canvas, at.astype(np.int32), track, laid))
-        self.film[here], self.hair[here], self.taken = laid.film, laid.hair, laid.taken
+        self.film[here], self.hair[here], self.laid = laid.film, laid.hair, laid
 
     def on(self, corner, sides):
         """(film, hair) on a rectangle of the canvas."""
@@ -173,8 +175,7 @@ class Stream:
     def _laid(self) -> Film:
         """The film of the stroke so far."""
         if self._film is None:
-            bristles = self._tracks[0].position.shape[-1]
-            self._film = Film(self.options.pixel, self.canvas.height, bristles)
+            self._film = Film(self.options.pixel, self.canvas.height, self._tracks[0])
         for track in self._bare:
             self._film.add(track)
         self._bare = []

@@ -11,7 +11,8 @@ import numpy as np
 import pytest
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.film import ENDS, MEMORY, STANDS, WAKE, Laid, _meet, laid_film, lay_on
+from jaxbrush.film import ENDS, MEMORY, STANDS, WAKE, Laid, _meet, dipped, laid_film, lay_on
+from jaxbrush.paint import weave
 from jaxbrush.paint.state import make_params
 from jaxbrush.raster import make_grid
 
@@ -37,10 +38,24 @@ def pulled(y, high=0.0, step=0.1, length=6.0, start=1.0):
     )  # fmt: skip
 
 
-@functools.partial(jax.jit, static_argnames=("shape", "wake"))
-def both(track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0), wake=WAKE):
-    with mock.patch("jaxbrush.film.WAKE", wake):
-        return laid_film(make_grid(shape, origin, PIXEL), track, hairs, load, height)
+def endless(**changes):
+    """Constants of a brush that is as full at the end as it was."""
+    return make_params(tip_volume=7.5e4, refill=0.0, **changes)
+
+
+def not_refilled():
+    return make_params(refill=0.0)
+
+
+@functools.partial(jax.jit, static_argnames=("shape", "wake", "params"))
+def both(
+    track, height, hairs=1.0, load=LOAD, shape=(32, 80), origin=(0.0, 0.0), wake=WAKE,
+    relief=0.0, params=endless,
+):  # fmt: skip
+    """On a smooth canvas, if not said otherwise, by a brush that does not run dry."""
+    grid = make_grid(shape, origin, PIXEL)
+    with mock.patch.multiple("jaxbrush.film", WAKE=wake, make_params=params):
+        return laid_film(grid, track, hairs, load, height, relief)
 
 
 def film(*args, **named):
@@ -120,6 +135,44 @@ def test_grooves_follow_single_hairs():
         assert min(after[12], after[18]) > least * EVEN and after[15] == 0.0
 
 
+def test_a_brush_runs_dry_and_no_paint_is_made_or_lost():
+    """Through wet paint, which it takes up too, and on over bare canvas. Naively, at the load it
+    was dipped with, it lays as much at the end as before."""
+    track = pulled(np.random.default_rng(0).uniform(1.2, 2.8, 40), start=0.5, length=7.5)
+    height = BARE.at[8:24, 16:28].set(0.3)
+    none = jnp.zeros(40)
+    grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
+    start = Laid(film=height, hair=BARE, taken=none, tip=none, behind=none)
+    begun = dipped(PIXEL, 1.0, 0.03, start)
+    laid = jax.jit(lay_on, static_argnums=3)(grid, track, 1.0, (32, 80), begun, 0.0)
+    total = lambda x: sum(float(a.sum()) for a in (x.film, x.taken, x.tip, x.behind))  # noqa: E731
+    assert total(laid) == pytest.approx(total(begun), rel=1e-6)
+    assert float(laid.tip.min()) >= 0.0 and float(laid.behind.min()) >= 0.0
+    assert float(laid.tip.max()) <= 1.8 * float(begun.tip[0]) / 0.03
+    thick = lambda film, a, b: float(film[10:22, int(a / PIXEL) : int(b / PIXEL)].mean())  # noqa: E731
+    dry, full = (
+        film(track, BARE, params=params, **STILL) for params in (not_refilled, endless)
+    )
+    assert thick(full, 7.0, 8.0) > 0.95 * thick(full, 2.0, 3.0)
+    assert thick(dry, 7.0, 8.0) < 0.6 * thick(dry, 2.0, 3.0)
+
+
+def test_a_dry_brush_paints_the_threads_of_a_coarse_weave_and_a_full_one_fills_it():
+    track = pulled(np.random.default_rng(0).uniform(1.2, 2.8, 60))
+    cloth = np.asarray(weave((32, 80), PIXEL, 0.09))[11:21, 24:48]
+
+    def films(load, relief):
+        found = np.asarray(film(track, BARE, load=load, relief=relief, **STILL))[11:21, 24:48]
+        return found[cloth > 0.07].mean(), found[cloth < 0.02].mean()
+
+    threads, between = films(0.25, 0.09)
+    naive = films(0.25, 0.0)
+    full = films(0.8, 0.09)
+    print("film on threads and between [mm]:", threads, between, naive, full)
+    assert threads > 3.0 * between and naive[0] < 1.3 * naive[1]
+    assert full[1] > full[0]
+
+
 def test_hair_in_the_film_has_the_volume_that_is_there():
     # Hair that stays long enough in deep paint: its volume but for the taper, 0.75 on average.
     track = pulled([1.5, 2.5], length=0.0, start=3.0)
@@ -180,7 +233,7 @@ def test_points_close_at_the_tip_find_where_standing_hair_touches():
 
     def laid(ends):
         with mock.patch("jaxbrush.film.ENDS", tuple(ends)):
-            run = jax.jit(lambda track: laid_film(grid, track, 1.0, LOAD, BARE)[0])
+            run = jax.jit(lambda track: laid_film(grid, track, 1.0, LOAD, BARE, 0.0)[0])
             return [np.asarray(run(leaning(angle))) for angle in (0.05, 0.8)]
 
     many = laid(np.linspace(0.0, 1.0, 33))
@@ -189,7 +242,7 @@ def test_points_close_at_the_tip_find_where_standing_hair_touches():
         for f in (laid(ENDS), laid(np.linspace(0.0, 1.0, 5)))
     )
     print("flat, standing:", ours, even)
-    assert ours[1] < 0.12 and even[1] > 0.25
+    assert ours[1] < 0.12 and even[1] > 0.2
     assert max(ours) < 0.15
 
 
@@ -206,10 +259,12 @@ def test_what_hair_takes_along_stays_where_it_lifts():
     )  # fmt: skip
     wet = BARE + 0.3
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    begun = Laid(film=wet, hair=BARE, taken=jnp.zeros(60))
+    none = jnp.zeros(60)
+    begun = Laid(film=wet, hair=BARE, taken=none, tip=none, behind=none)
+    begun = dipped(PIXEL, 1.0, LOAD, begun)
     track_of = lambda s: jax.tree.map(lambda x: x[s], track)  # noqa: E731
-    until = lay_on(grid, track_of(slice(0, 61)), 1.0, LOAD, (32, 80), begun)
-    laid = lay_on(grid, track_of(slice(60, n)), 1.0, LOAD, (32, 80), until)
+    until = lay_on(grid, track_of(slice(0, 61)), 1.0, (32, 80), begun, 0.0)
+    laid = lay_on(grid, track_of(slice(60, n)), 1.0, (32, 80), until, 0.0)
     held = float(until.taken.sum())
     # What they hold while they go is what some millimetres of the way bring.
     brought = (0.3 - STANDS * EVEN) * 0.9 / PIXEL**2
@@ -224,12 +279,13 @@ def test_what_hair_takes_along_stays_where_it_lifts():
 
 def test_paint_that_is_taken_along_is_neither_made_nor_lost(monkeypatch):
     """Hair that lays and lifts nothing itself."""
-    monkeypatch.setattr("jaxbrush.film.make_params", lambda: make_params(deposit=0.0))
+    monkeypatch.setattr("jaxbrush.film.make_params", lambda: endless(deposit=0.0))
     track = pulled(np.random.default_rng(1).uniform(1.2, 2.8, 40), length=4.0)
     start = BARE + 0.3
-    begun = Laid(film=start, hair=BARE, taken=jnp.zeros(40))
+    none = jnp.zeros(40)
+    begun = Laid(film=start, hair=BARE, taken=none, tip=none, behind=none)
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    laid = lay_on(grid, track, 1.0, LOAD, (32, 80), begun)
+    laid = lay_on(grid, track, 1.0, (32, 80), dipped(PIXEL, 1.0, LOAD, begun))
     assert float(laid.taken.sum()) > 1.0
     total = float(laid.film.sum() + laid.taken.sum())
     assert total == pytest.approx(float(start.sum()), rel=1e-6)
@@ -239,31 +295,34 @@ def test_paint_that_is_taken_along_is_neither_made_nor_lost(monkeypatch):
 def test_a_stroke_in_pieces_is_as_the_whole():
     height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.2)
     track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
-    whole = both(track, height)
+    whole = both(track, height, relief=0.09, params=make_params)
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    laid = Laid(film=height, hair=BARE, taken=jnp.zeros(40))
-    go = jax.jit(lay_on, static_argnums=4)
+    none = jnp.zeros(40)
+    laid = Laid(film=height, hair=BARE, taken=none, tip=none, behind=none)
+    laid = dipped(PIXEL, 1.0, LOAD, laid)
+    go = jax.jit(lay_on, static_argnums=3)
     for first in range(0, 140, 20):
         piece = jax.tree.map(lambda x, a=first: x[a : a + 21], track)
         piece = dataclasses.replace(piece, valid=piece.valid & (jnp.arange(21) >= int(first > 0)))
-        laid = go(grid, piece, 1.0, LOAD, (32, 80), laid)
+        laid = go(grid, piece, 1.0, (32, 80), laid, 0.09)
     np.testing.assert_allclose(laid.film, whole[0], atol=1e-6)
     np.testing.assert_allclose(laid.hair, whole[1], atol=1e-6)
 
 
 def test_grids_that_hold_a_stroke_are_as_the_whole_canvas_to_the_bit():
+    film = functools.partial(both, relief=0.09, params=make_params)
     height = jax.random.uniform(jax.random.key(0), (32, 80), maxval=0.2)
     track = pulled(np.random.default_rng(0).uniform(1.3, 2.7, 40), start=4.0, length=2.0)
-    whole = np.asarray(film(track, height))
+    whole = np.asarray(film(track, height)[0])
     origin = jnp.asarray([24 * PIXEL, 8 * PIXEL])
-    part = np.asarray(film(track, height, shape=(16, 40), origin=origin))
+    part = np.asarray(film(track, height, shape=(16, 40), origin=origin)[0])
     np.testing.assert_array_equal(part, whole[8:24, 24:64])
     # So are those of one that comes from beyond the canvas and goes there.
     track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
-    whole = np.asarray(film(track, height))
+    whole = np.asarray(film(track, height)[0])
     # Off its edges the canvas goes on, as the networks see it.
     origin = jnp.asarray([-8 * PIXEL, -8 * PIXEL])
-    around = np.asarray(film(track, height, shape=(48, 96), origin=origin))
+    around = np.asarray(film(track, height, shape=(48, 96), origin=origin)[0])
     np.testing.assert_array_equal(around[8:40, 8:88], whole)
     np.testing.assert_array_equal(around[:4, 8:88], np.broadcast_to(height[0], (4, 80)))
 
@@ -274,14 +333,15 @@ def test_slopes_are_those_of_differences_and_finite():
 
     def total(shift, raised):
         position = track.position + jnp.stack([0.0 * shift, shift, raised])[None, None, :, None]
-        found = film(dataclasses.replace(track, position=position), height)
+        track_there = dataclasses.replace(track, position=position)
+        found = film(track_there, height, relief=0.05, params=make_params)
         return jnp.sum(found * jnp.linspace(0.0, 1.0, 32)[:, None])
 
     with jax.enable_x64(False):
-        slopes = jax.grad(total, (0, 1))(0.013, 0.02)
+        slopes = jax.grad(total, (0, 1))(0.013, 0.07)
         e = 2e-3
-        by_shift = (total(0.013 + e, 0.02) - total(0.013 - e, 0.02)) / (2 * e)
-        by_height = (total(0.013, 0.02 + e) - total(0.013, 0.02 - e)) / (2 * e)
+        by_shift = (total(0.013 + e, 0.07) - total(0.013 - e, 0.07)) / (2 * e)
+        by_height = (total(0.013, 0.07 + e) - total(0.013, 0.07 - e)) / (2 * e)
     np.testing.assert_allclose(slopes, (by_shift, by_height), rtol=0.03)
     none = jax.grad(lambda h: film(pulled([2.0], high=0.0), h).sum())(BARE)
     assert np.all(np.isfinite(none))

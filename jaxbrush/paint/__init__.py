@@ -13,4 +13,5 @@ from jaxbrush.paint.state import height as height
 from jaxbrush.paint.state import load_brush as load_brush
 from jaxbrush.paint.state import make_params as make_params
 from jaxbrush.paint.state import volume as volume
+from jaxbrush.paint.state import RELIEF as RELIEF
 from jaxbrush.paint.state import weave as weave

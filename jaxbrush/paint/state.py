@@ -204,10 +204,22 @@ def height(config: PaintConfig, canvas) -> jax.Array:
     return config.layer * jnp.sum(canvas, axis=(0, 1))
 
 
-def weave(shape, pixel: float, depth: float = 0.03, pitch: float = 0.45) -> np.ndarray:
-    """Height of a plain-woven canvas, (y, x) [mm]: threads `pitch` apart, going over and under."""
-    y = (np.arange(shape[0]) + 0.5)[:, None] * pixel / pitch
-    x = (np.arange(shape[1]) + 0.5)[None, :] * pixel / pitch
-    over = 0.5 + 0.5 * np.cos(np.pi * (np.floor(y) + np.floor(x)))
-    across, along = np.abs(np.sin(np.pi * y)), np.abs(np.sin(np.pi * x))
-    return depth * (over * across + (1.0 - over) * along)
+RELIEF = 0.03
+"""Depth of the usual weave [mm]: any brush fills it. On one of some 0.09 mm a dry brush catches."""
+
+
+def weave(shape, pixel: float, depth=RELIEF, pitch: float = 0.45, first=(0, 0)) -> jax.Array:
+    """Height of a plain-woven canvas, (y, x) [mm]: threads `pitch` apart, going over and under.
+
+    Args:
+      depth: () [mm]. first: number of the first pixel (y, x) on the canvas, may be traced.
+    """
+    y, x = (
+        (jnp.arange(n, dtype=jnp.int32) + at).astype(float) * (pixel / pitch)
+        + 0.5 * (pixel / pitch)
+        for n, at in zip(shape, first, strict=True)
+    )
+    y, x = y[:, None], x[None, :]
+    odd = jnp.mod(jnp.floor(y) + jnp.floor(x), 2.0)
+    across, along = jnp.abs(jnp.sin(jnp.pi * y)), jnp.abs(jnp.sin(jnp.pi * x))
+    return depth * jnp.where(odd > 0.5, along, across)
