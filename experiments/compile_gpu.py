@@ -154,13 +154,12 @@ def canvases(quick: bool):
     chosen = data.PRESETS["tiny" if quick else "paper"]
     options, count = chosen.pairs, chosen.shard
     shape = (options.size + 2 * pairs.MARGIN,) * 2
-    one = pairs.draw(options, jax.random.key(0)), pairs.draw_palette(
-        jax.random.key(0), options.paint.pigments
-    )  # fmt: skip
+    key = jax.random.key(0)
+    one = pairs.draw(options, key), pairs.draw_palette(key, options.paint.pigments), jnp.zeros(())
     given = _shapes((*one, empty_canvas(options.paint, shape)))
     given = jax.tree.map(lambda x: jax.ShapeDtypeStruct((count, *x.shape), x.dtype), given)
-    function = functools.partial(jax.vmap(pairs.paint_pair, in_axes=(None, 0, 0, 0, None)), options)
-    return {f"{count} canvases of {options.size} px": (function, (*given, jnp.zeros(shape)))}
+    function = functools.partial(jax.vmap(pairs.paint_pair, in_axes=(None, 0, 0, 0, 0)), options)
+    return {f"{count} canvases of {options.size} px": (function, given)}
 
 
 def training(quick: bool, batch: int):

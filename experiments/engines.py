@@ -19,6 +19,7 @@ from jaxbrush import data, painter
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
 from jaxbrush.canvas import Canvas, absorbed, blank, flatten, reflected
 from jaxbrush.paint import (
+    RELIEF,
     PaintConfig,
     PaintParams,
     empty_canvas,
@@ -156,7 +157,10 @@ def _moved(brush, stroke, spacing, stamps):
 class Simulator:
     """The paint simulator as an engine."""
 
-    def __init__(self, config: PaintConfig, spacing: float, shape, palette, bristles: int | None):
+    def __init__(
+        self, config: PaintConfig, spacing: float, shape, palette, bristles: int | None,
+        relief: float = RELIEF,
+    ):  # fmt: skip
         self.config = dataclasses.replace(config, pigments=len(palette))
         self.spacing, self.shape, self.palette = spacing, tuple(shape), jnp.asarray(palette)
         self.bristles = bristles
@@ -167,7 +171,7 @@ class Simulator:
         self.inside = tuple(slice(self.margin, self.margin + n) for n in inner)
         size = tuple(n + 2 * self.margin for n in inner)
         self.paint_canvas = empty_canvas(self.config, size)
-        self.tooth = weave(size, config.pixel)
+        self.tooth = weave(size, config.pixel, relief)
         self._move, self._lay = jax.jit(_moved, static_argnums=3), jax.jit(paint_stroke)
 
     def paint(self, deed: Deed) -> dict[str, float]:
@@ -295,15 +299,16 @@ TAUGHT = data.PRESETS["cpu"].pairs
 """The simulator as the networks were taught by it."""
 
 
-def make(name: str, shape, deeds: list[Deed], weights=SHIPPED):
-    """An engine by name: "neural", "realtime" or "offline".
+def make(name: str, shape, deeds: list[Deed], weights=SHIPPED, relief: float = RELIEF):
+    """An engine by name, "neural", "realtime" or "offline", for a canvas with a weave `relief` [mm]
+    deep.
 
     Raises:
       ValueError, OSError: weights that are not there, or none.
     """
     if name == "neural":
-        return Neural(painter.PainterConfig(), painter.load_nets(*weights), shape)
+        return Neural(painter.PainterConfig(relief=relief), painter.load_nets(*weights), shape)
     if name == "offline":
-        return Simulator(TAUGHT.paint, TAUGHT.spacing, shape, palette_of(deeds), None)
+        return Simulator(TAUGHT.paint, TAUGHT.spacing, shape, palette_of(deeds), None, relief)
     config, _, spacing = presets.realtime()
-    return Simulator(config, spacing, shape, palette_of(deeds), presets.REAL // 2)
+    return Simulator(config, spacing, shape, palette_of(deeds), presets.REAL // 2, relief)

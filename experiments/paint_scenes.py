@@ -189,6 +189,7 @@ RELIEF = {"dry": 0.09}
 # shape, width, thickness, length, press depth [mm]: brushes such as the networks learned from
 _RECORDED = {
     "flat": ("flat", 3.8, 1.14, 17.4, 4.35), "small flat": ("flat", 2.4, 0.75, 13.2, 3.3),
+    "filbert": ("filbert", 3.8, 1.14, 17.4, 4.35),
     "round": ("round", 2.2, 2.2, 12.6, 3.15), "rigger": ("round", 1.4, 1.4, 10.2, 2.55),
 }  # fmt: skip
 _FIELDS = ("shape", "width", "thickness", "length", "depth")

@@ -11,7 +11,6 @@ from pathlib import Path
 from typing import Literal
 
 import cv2
-import jax.numpy as jnp
 import numpy as np
 import tyro
 from PIL import Image
@@ -22,7 +21,7 @@ from experiments.common import console, helped, print_table, results_folder, wri
 from jaxbrush import recordings
 from jaxbrush.batches import LEVELS
 from jaxbrush.canvas import Canvas, to_srgb
-from jaxbrush.paint import weave
+from jaxbrush.paint import RELIEF, weave
 from jaxbrush.render import picture, shade
 
 FRAME = 480
@@ -35,11 +34,16 @@ class Config:
 
     recording: Path | None = None
     """A session of jaxbrush (.jsonl), of libmypaint (.dat) or of a Wacom pad (.jsonl.gz) [default:
-    the sea of show_paint, as a pen would have drawn it]."""
+    a scene]."""
+    scene: Literal["sea", "dry"] = "sea"
+    """A sheet of show_paint, as a pen would have drawn it: painted where no recording is given."""
     engine: Literal["neural", "realtime", "offline"] = "neural"
     """The networks, the simulator at its fastest setting, or as the networks were taught."""
     pixels: tuple[int, int] | None = None
     """Height and width of the canvas, which the recording is scaled to [default: its own]."""
+    relief: float | None = None
+    """Depth of the canvas's weave [mm] [default: that of the scene, else 0.03]; on a coarse one of
+    0.06 to 0.1 a dry brush catches."""
     strokes: int | None = None
     """Paints the first so many only."""
     weights: tuple[Path, Path] = engines.SHIPPED
@@ -50,14 +54,14 @@ class Config:
     """Six strokes."""
 
 
-def read(path: Path | None) -> recordings.Session:
-    """A recorded session of any format, or the one that comes along.
+def read(path: Path | None, scene: str = "sea") -> recordings.Session:
+    """A recorded session of any format, or a scene that comes along.
 
     Raises:
       RecordingError: the file, its line and what was expected there.
     """
     if path is None:
-        return paint_scenes.recorded()
+        return paint_scenes.recorded(scene)
     if path.suffix == ".dat":
         return recordings.read_mypaint(path)
     return recordings.read_wacom(path) if path.suffix == ".gz" else recordings.read(path)
@@ -73,15 +77,15 @@ def save(path: Path, image: np.ndarray) -> None:
     os.replace(partial, path)
 
 
-def lit(canvas: Canvas) -> np.ndarray:
-    """The canvas under a lamp, 8-bit RGB."""
-    cloth = weave(canvas.height.shape, engines.PIXEL)
+def lit(canvas: Canvas, relief: float = RELIEF) -> np.ndarray:
+    """The canvas under a lamp, its weave `relief` [mm] deep, 8-bit RGB."""
+    cloth = weave(canvas.height.shape, engines.PIXEL, relief)
     return np.asarray(picture(shade(canvas, engines.PIXEL, weave=cloth)))
 
 
-def frame(canvas: Canvas) -> Image.Image:
+def frame(canvas: Canvas, relief: float) -> Image.Image:
     """A picture of the time-lapse."""
-    image = Image.fromarray(lit(canvas))
+    image = Image.fromarray(lit(canvas, relief))
     image.thumbnail((FRAME, FRAME))
     return image.quantize(128)
 
@@ -97,28 +101,32 @@ def stages_of(spent: list[dict]) -> list[list]:
 
 def main(options: Config) -> None:
     try:
-        session = read(options.recording)
+        relief = options.relief
+        if relief is None:
+            usual = {} if options.recording else paint_scenes.RELIEF
+            relief = usual.get(options.scene, RELIEF)
+        session = read(options.recording, options.scene)
         side = np.asarray(session.canvas)[::-1] / engines.PIXEL
         shape = tuple(int(n) for n in options.pixels or np.ceil(side))
         deeds = engines.deeds_of(session, shape)
-        engine = engines.make(options.engine, shape, deeds, options.weights)
+        engine = engines.make(options.engine, shape, deeds, options.weights, relief)
     except (ValueError, OSError) as error:
         raise SystemExit(f"{error}") from error
     if not deeds:
         raise SystemExit(f"{options.recording}: no strokes in it")
     folder = results_folder("paint_session", options.out)
     deeds = deeds[: 6 if options.quick else options.strokes]
-    spent, frames = [], [frame(engine.canvas())]
+    spent, frames = [], [frame(engine.canvas(), relief)]
     every = max(1, len(deeds) // 60)
     for number, deed in enumerate(track(deeds, f"{options.engine} paints", console=console), 1):
         spent.append(engine.paint(deed))
         if number % every == 0 or number == len(deeds):
-            frames.append(frame(engine.canvas()))
+            frames.append(frame(engine.canvas(), relief))
     canvas = engine.canvas()
     height = np.clip(np.asarray(canvas.height) / LEVELS["height"], 0.0, 1.0)
     save(folder / "height.png", (65535.0 * height + 0.5).astype(np.uint16))
     save(folder / "color.png", (255.0 * np.asarray(to_srgb(canvas.color)) + 0.5).astype(np.uint8))
-    save(folder / "lit.png", lit(canvas))
+    save(folder / "lit.png", lit(canvas, relief))
     partial = folder / "timelapse.partial"
     frames[0].save(partial, "GIF", save_all=True, append_images=frames[1:], duration=120, loop=0)
     os.replace(partial, folder / "timelapse.gif")

@@ -4,8 +4,14 @@ Hair that passes through a column of paint draws its film towards the thickness 
 film are in equilibrium, as the simulator's transfer does (`jaxbrush.paint.transfer`), and takes
 along what stands above it; nothing flows. That is no picture of the stroke, but it has the grooves
 of single bristles, where the maps of the bristle that came last have none: at their scale (between
-Gaussians of 1 and 2.5 pixels) its correlation with the simulator's heights is 0.5, median over some
+Gaussians of 1 and 2.5 pixels) its correlation with the simulator's heights is 0.7, median over some
 60 strokes, that of the sweep count 0.0.
+
+Bristles run dry as they do there: each holds what the brush was loaded with, lays it and takes up
+what it lifts, and is refilled from behind. A dry one has a thin coat, lays little, and on a coarse
+weave reaches the threads alone. With a coat as thick as at first everywhere the film is 96 µm off
+the simulator (rms in the masks of those strokes), with this 77; where the brush holds next to
+nothing 66 and 34.
 
 A brush is full of paint that moves with it, two to four times as high as the film it leaves, the
 more the longer it goes over wet paint, and where it lifts that stays as a ridge. No network that

@@ -371,7 +371,9 @@ def paint_pair(options: PairConfig, plan: Plan, palette, relief, canvas):
         thick, options.paint.layer, palette, plan.paint.opacity, mixing="subtractive"
     ).color[0, 0]
     grid = make_grid((options.size, options.size), pixel=options.paint.pixel)
-    drawn = on_way(loaded(track, plan.brush, plan.load, relief), plan.stroke, plan.brush.press_depth)
+    drawn = on_way(
+        loaded(track, plan.brush, plan.load, relief), plan.stroke, plan.brush.press_depth
+    )
     drawn = jax.tree.map(lambda x: x[:: options.every], drawn)
     before, now = seen(canvas), seen(after)
     told, maps = drawn_maps(grid, drawn, before, own)

@@ -19,7 +19,9 @@ _UPRIGHT = {"altitude": 0.5 * np.pi, "azimuth": 0.0, "twist": 0.0}
 
 def _piece(options: PainterConfig, brush, load, motion, stroke, way):
     track, motion = advance(options.brush, brush, motion, stroke)
-    track = on_steps(options, dataclasses.replace(loaded(track, brush, load, options.relief), time=way))
+    track = on_steps(
+        options, dataclasses.replace(loaded(track, brush, load, options.relief), time=way)
+    )
     return track, touches(options, track), motion
 
 

@@ -40,14 +40,15 @@ class PainterConfig:
     """Static choices.
 
     pixel: side of a pixel of the canvas [mm], that of the training pairs. relief: depth of its
-    weave [mm], on one of some 0.09 a dry brush catches. brush: how bristles are simulated. patches: how a stroke is cut. blend: how patches become one picture, one of BLENDS.
-    moments: "patch", each normalised by its own moments; or "stroke", by those of all of its
-    stroke, which are then painted at once and show no seam side by side ("cut"). edge: of soft maps
-    [mm], or None for exact ones. stamps: buckets of stamps; a stroke that needs more gets the most,
-    further apart. cells: buckets of the side of a box, in patches. sides: buckets of the sides
-    [pixels] of the rectangle round a stroke, which is painted in one piece, without patches, where
-    that is fewer pixels and moments are "stroke"; () is never. batch: patches that the networks are
-    given at once, where moments allow.
+    weave [mm], on one of some 0.09 a dry brush catches. brush: how bristles are simulated. patches:
+    how a stroke is cut. blend: how patches become one picture, one of BLENDS. moments: "patch",
+    each normalised by its own moments; or "stroke", by those of all of its stroke, which are then
+    painted at once and show no seam side by side ("cut"). edge: of soft maps [mm], or None for
+    exact ones. stamps: buckets of stamps; a stroke that needs more gets the most, further apart.
+    cells: buckets of the side of a box, in patches. sides: buckets of the sides [pixels] of the
+    rectangle round a stroke, which is painted in one piece, without patches, where that is fewer
+    pixels and moments are "stroke"; () is never. batch: patches that the networks are given at
+    once, where moments allow.
     """
 
     pixel: float = 0.125
@@ -78,6 +79,8 @@ class PainterConfig:
             raise ValueError(
                 f"PainterConfig.sides = {self.sides}: expected rising multiples of 4, or none"
             )
+        if not 0.0 <= self.relief < np.inf:
+            raise ValueError(f"PainterConfig.relief = {self.relief}: expected >= 0 mm")
         if not self.pixel > 0.0 or self.batch < 1:
             raise ValueError(
                 f"PainterConfig.pixel = {self.pixel}, batch = {self.batch}: expected a positive "

@@ -13,7 +13,7 @@ from experiments import evaluate, make_dataset, train_network
 from jaxbrush import batches, checkpoint, data, pairs
 from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
-from jaxbrush.paint import PaintConfig
+from jaxbrush.paint import RELIEF, PaintConfig
 from jaxbrush.painter import HEIGHT_INPUTS
 from jaxbrush.train import Batch
 
@@ -223,6 +223,8 @@ def test_options_that_do_not_fit_are_refused():
     for spacing in (0.0, 0.1, 0.25):
         with pytest.raises(ValueError, match=f"PairConfig.spacing = {spacing}"):
             dataclasses.replace(SMALL, spacing=spacing)
+    with pytest.raises(ValueError, match="PairConfig.relief = 0.01"):
+        dataclasses.replace(SMALL, relief=0.01)
 
 
 def test_long_strokes_fit_their_stamps():
@@ -235,12 +237,23 @@ def test_long_strokes_fit_their_stamps():
         assert np.isclose(float(plan.mix.sum()), 1.0) and 0.0 < float(plan.load) <= 1.0
 
 
+def test_canvases_and_brushes_are_such_that_some_strokes_catch_on_the_weave():
+    options = pairs.PairConfig(beside=0)
+    begun = [pairs._begun(options, 0, number) for number in range(60)]
+    reliefs = np.asarray([float(relief) for _, relief, _ in begun])
+    usual = reliefs == np.float32(RELIEF)
+    assert 0.25 < usual.mean() < 0.75
+    assert RELIEF < reliefs[~usual].min() and 0.08 < reliefs.max() <= options.relief
+    loads = np.asarray([float(plan(0).load) for *_, plan in begun])
+    assert 0.05 <= loads.min() and 0.05 < np.mean(loads < 0.25) < 0.3
+
+
 def test_some_canvases_are_painted_side_by_side():
     """Strokes at random hardly ever run along the edge of another; a painter's do."""
     options = pairs.PairConfig()
 
     def paths(options, number):
-        _, plan = pairs._begun(options, 0, number)
+        _, _, plan = pairs._begun(options, 0, number)
         plans = [plan(k) for k in range(options.strokes)]
         ends = []
         for p in plans:

@@ -150,9 +150,7 @@ def test_a_brush_runs_dry_and_no_paint_is_made_or_lost():
     assert float(laid.tip.min()) >= 0.0 and float(laid.behind.min()) >= 0.0
     assert float(laid.tip.max()) <= 1.8 * float(begun.tip[0]) / 0.03
     thick = lambda film, a, b: float(film[10:22, int(a / PIXEL) : int(b / PIXEL)].mean())  # noqa: E731
-    dry, full = (
-        film(track, BARE, params=params, **STILL) for params in (not_refilled, endless)
-    )
+    dry, full = (film(track, BARE, params=params, **STILL) for params in (not_refilled, endless))
     assert thick(full, 7.0, 8.0) > 0.95 * thick(full, 2.0, 3.0)
     assert thick(dry, 7.0, 8.0) < 0.6 * thick(dry, 2.0, 3.0)
 

@@ -100,9 +100,9 @@ def test_pairs_side_by_side():
     plans = [pairs.draw(options, key) for key in jax.random.split(jax.random.key(0))]
     shape = (options.size + 2 * pairs.MARGIN,) * 2
     both = lambda x: jnp.stack([x, x])  # noqa: E731
-    run = functools.partial(jax.vmap(pairs.paint_pair, in_axes=(None, 0, 0, 0, None)), options)
+    run = functools.partial(jax.vmap(pairs.paint_pair, in_axes=(None, 0, 0, 0, 0)), options)
     given = jax.tree.map(lambda *x: jnp.stack(x), *plans), both(jnp.ones((2, 3)))
-    assert not lowers(run, *given, both(empty_canvas(grid, shape)), jnp.zeros(shape))
+    assert not lowers(run, *given, jnp.full(2, 0.05), both(empty_canvas(grid, shape)))
 
 
 def variables(config, inputs):

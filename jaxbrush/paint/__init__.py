@@ -4,6 +4,7 @@ from jaxbrush.paint.heightfield import heightfield_config as heightfield_config
 from jaxbrush.paint.heightfield import heightfield_stroke as heightfield_stroke
 from jaxbrush.paint.rollout import PaintReport as PaintReport
 from jaxbrush.paint.rollout import paint_stroke as paint_stroke
+from jaxbrush.paint.state import RELIEF as RELIEF
 from jaxbrush.paint.state import BrushPaint as BrushPaint
 from jaxbrush.paint.state import PaintConfig as PaintConfig
 from jaxbrush.paint.state import PaintParams as PaintParams
@@ -13,5 +14,4 @@ from jaxbrush.paint.state import height as height
 from jaxbrush.paint.state import load_brush as load_brush
 from jaxbrush.paint.state import make_params as make_params
 from jaxbrush.paint.state import volume as volume
-from jaxbrush.paint.state import RELIEF as RELIEF
 from jaxbrush.paint.state import weave as weave
