@@ -10,12 +10,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush.canvas import absorbed, from_srgb, reflected, to_srgb
-from jaxbrush.mixing import COLORS
+from jaxbrush.mixing import COLORS, LEVEL
 from jaxbrush.pairs import COAT
 from jaxbrush.train import Batch
 
 LEVELS = {
-    "height": 1.25, "pressure": 6.0, "sweeps": 64.0, "time": 64.0, "tip": COAT, "film": 1.25,
+    "height": LEVEL, "pressure": 6.0, "sweeps": 64.0, "time": 64.0, "tip": COAT, "film": 1.25,
     "hair": 0.05,
 }  # fmt: skip
 """Values that uint16's 65535 stands for: height [mm], pressure [maps' unit], sweeps, way of the
@@ -122,7 +122,8 @@ def color_batch(
     -> new color, all in sRGB.
 
     Args:
-      time, height: whether these maps are given (paper Figures 4 and 5).
+      time, height: whether these maps are given (paper Figures 4 and 5). A network that mixes is
+        else told that the paint hides the canvas.
       mixes: for a network that mixes colors: the brush's color wherever its paint may come to, the
         color that bristles had picked up; and besides time and new height how much they had, the
         height before, the sweep count and the load.
@@ -146,6 +147,8 @@ def color_batch(
         parts.append(network_time(jnp.asarray(pairs["time"])))
     if height:
         parts.append(network_height(jnp.asarray(pairs["new_height"])))
+    elif mixes:
+        parts.append(jnp.ones_like(parts[-1]))
     return Batch(
         inputs=jnp.concatenate(parts, axis=-1),
         target=_network(jnp.asarray(pairs["new_color"])),

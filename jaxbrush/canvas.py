@@ -7,6 +7,8 @@ from jaxbrush.structs import state
 
 LINEN = (0.80, 0.76, 0.68)
 """Default ground, linear RGB: primed canvas."""
+OPACITY = 0.03
+"""Default film thickness that hides 63 % of what is under it [mm]."""
 
 
 @state
@@ -94,7 +96,7 @@ def mix_subtractive(shares, palette, exponent: float = 0.35):
 MIXING = {"linear": mix_linear, "subtractive": mix_subtractive}
 
 
-def flatten(paint, layer, palette, opacity=0.03, ground=LINEN, mixing: str = "linear") -> Canvas:
+def flatten(paint, layer, palette, opacity=OPACITY, ground=LINEN, mixing: str = "linear") -> Canvas:
     """What is seen of a paint volume from above.
 
     Light is absorbed in paint by Beer and Lambert's law: a film of thickness s hides the share

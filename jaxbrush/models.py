@@ -244,8 +244,9 @@ class Generator(nn.Module):
         x = Conv(outputs, c.dtype, name="decode4")(join(x, first)).astype(jnp.float32)
         if not c.mixes:
             return jnp.tanh(x)
-        color = mixing.mix(x[..., : mixing.PAINTS], inputs)
-        return color if c.outputs == 3 else join(color, jnp.tanh(x[..., mixing.PAINTS :]))
+        height = inputs[..., -1:] if c.outputs == 3 else jnp.tanh(x[..., mixing.PAINTS :])
+        color = mixing.mix(x[..., : mixing.PAINTS], inputs, height)
+        return color if c.outputs == 3 else join(color, height)
 
 
 def inputs_of(options: GeneratorConfig, params: dict) -> int:

@@ -8,19 +8,35 @@ import numpy as np
 import pytest
 
 from jaxbrush import mixing
-from jaxbrush.batches import recolored
-from jaxbrush.canvas import absorbed, from_srgb, mix_subtractive, reflected, to_srgb
+from jaxbrush.batches import network_height, recolored
+from jaxbrush.canvas import (
+    LINEN,
+    absorbed,
+    flatten,
+    from_srgb,
+    mix_subtractive,
+    reflected,
+    to_srgb,
+)
 from jaxbrush.models import Generator, GeneratorConfig, inputs_of
 from jaxbrush.train import Batch
 
 SIDE = 16
-mix = jax.jit(mixing.mix)
+
+
+def plain(logits, inputs):
+    """The mixture on the new height that a color network is told."""
+    return mixing.mix(logits, inputs, inputs[..., -1:])
+
+
+mix = jax.jit(plain)
 
 
 def inputs_like(rng, more=6):
-    """Random colors and maps, (1, h, w, 9 + more) in network scale."""
+    """Random colors and maps, (1, h, w, 9 + more) in network scale; paint that hides the ground."""
     colors = rng.uniform(-0.9, 0.9, (1, SIDE, SIDE, mixing.COLORS))
     maps = rng.uniform(-1.0, 1.0, (1, SIDE, SIDE, more))
+    maps[..., [mixing.BEFORE - mixing.COLORS, -1]] = rng.uniform(-0.2, 1.0, (1, SIDE, SIDE, 2))
     return jnp.asarray(np.concatenate([colors, maps], -1), jnp.float32)
 
 
@@ -103,6 +119,51 @@ def test_two_paints_mix_as_the_simulators_pigments_do():
         np.testing.assert_allclose(found[y, x], want, atol=2e-4)
 
 
+def seen(paints, height):
+    """What the simulator's canvas shows of two pigments, volumes [mm], in sRGB of [-1, 1]."""
+    layer, palette = 0.0625, jnp.asarray([[0.9, 0.25, 0.02], [0.02, 0.08, 0.4]])
+    share = jnp.asarray(paints, jnp.float32) / sum(paints)
+    levels = np.clip(height / layer - np.arange(20), 0.0, 1.0)
+    paint = jnp.asarray(levels, jnp.float32)[:, None, None, None] * share[None, :, None, None]
+    return 2.0 * to_srgb(flatten(paint, layer, palette, mixing="subtractive").color[0, 0]) - 1.0
+
+
+@pytest.mark.parametrize("before", [0.0, 0.004, 0.05, 0.4])
+@pytest.mark.parametrize("after", [0.005, 0.03, 0.1, 0.6])
+def test_thin_films_look_as_the_simulators(before, after):
+    """Half of each paint over canvas; a mixture with the ground itself is off by up to a tenth."""
+    old, brush, want = seen((0.0, 1.0), before), seen((1.0, 0.0), 5.0), seen((0.5, 0.5), after)
+    if before == 0.0:
+        old = 2.0 * to_srgb(jnp.asarray(LINEN)) - 1.0
+        want = seen((1.0, 0.0), after)
+    inputs = jnp.concatenate([old, brush, brush, network_height(jnp.asarray([0.0, before, after]))])
+    inputs = jnp.broadcast_to(inputs, (1, 4, 4, len(inputs)))
+    logits = jnp.full((1, 4, 4, mixing.PAINTS), -1e9).at[..., 0].set(0.0)
+    if before > 0.03:
+        logits = logits.at[..., 2 + mixing.PLACES.index((0, 0))].set(0.0)
+        np.testing.assert_allclose(mix(logits, inputs)[0, 1, 1], want, atol=2e-3)
+    elif before == 0.0:
+        np.testing.assert_allclose(mix(logits, inputs)[0, 1, 1], want, atol=2e-3)
+        # The mixture that comes nearest, of brush and ground.
+        share = np.linspace(0.0, 1.0, 101)[:, None]
+        ends = [absorbed(from_srgb(0.5 * (c + 1.0)))[None] for c in (brush, old)]
+        naive = 2.0 * to_srgb(reflected(share * ends[0] + (1.0 - share) * ends[1])) - 1.0
+        off = np.abs(np.asarray(naive) - np.asarray(want)).max(1).min()
+        assert off > 0.1 or after != 0.03
+    # What is not touched looks as it did.
+    still = jnp.full((1, 4, 4, mixing.PAINTS), -1e9)
+    still = still.at[..., 2 + mixing.PLACES.index((0, 0))].set(0.0)
+    same = inputs.at[..., -1].set(inputs[..., mixing.BEFORE])
+    np.testing.assert_allclose(mix(still, same)[0, 1, 1], old, atol=2e-3)
+
+
+def test_bare_canvas_of_any_ground_stays_and_shows_through():
+    """Also one that is not linen; and where there is no paint no share can color it."""
+    rng = np.random.default_rng(8)
+    inputs = inputs_like(rng).at[..., [mixing.BEFORE, -1]].set(-1.0)
+    np.testing.assert_allclose(mix(logits_like(rng), inputs), inputs[..., :3], atol=1e-4)
+
+
 def test_each_share_shows_its_own_paint():
     rng = np.random.default_rng(4)
     inputs = inputs_like(rng)
@@ -122,16 +183,18 @@ def test_each_share_shows_its_own_paint():
 def test_slopes_are_finite_for_black_and_white(color):
     rng = np.random.default_rng(5)
     inputs = inputs_like(rng).at[..., : mixing.COLORS].set(color)
-    slopes = jax.jit(jax.grad(lambda a, b: jnp.sum(mixing.mix(a, b)), (0, 1)))
-    for slope in slopes(logits_like(rng), inputs):
-        assert np.all(np.isfinite(slope))
+    slopes = jax.jit(jax.grad(lambda a, b: jnp.sum(plain(a, b)), (0, 1)))
+    for height in (0.5, -0.96, -1.0):
+        there = inputs.at[..., mixing.BEFORE].set(height).at[..., -1].set(height)
+        for slope in slopes(logits_like(rng), there):
+            assert np.all(np.isfinite(slope))
 
 
 def test_slopes_are_true():
     rng = np.random.default_rng(6)
     inputs, logits = inputs_like(rng), logits_like(rng, 1.0)
     way = jnp.asarray(rng.normal(size=logits.shape), jnp.float32)
-    error = jax.jit(lambda t: jnp.mean(mixing.mix(logits + t * way, inputs) ** 2))
+    error = jax.jit(lambda t: jnp.mean(plain(logits + t * way, inputs) ** 2))
     slope = float(jax.grad(error)(0.0))
     step = 1e-2
     assert (float(error(step)) - float(error(-step))) / (2 * step) == pytest.approx(slope, rel=0.02)
@@ -142,7 +205,7 @@ def test_compiled_equals_op_by_op_and_batched_equals_alone():
     two = [(logits_like(rng), inputs_like(rng)) for _ in range(2)]
     logits, inputs = (jnp.concatenate(x) for x in zip(*two, strict=True))
     found = mix(logits, inputs)
-    np.testing.assert_allclose(found, mixing.mix(logits, inputs), atol=1e-5)
+    np.testing.assert_allclose(found, plain(logits, inputs), atol=1e-5)
     np.testing.assert_allclose(found, jnp.concatenate([mix(*x) for x in two]), atol=1e-5)
 
 

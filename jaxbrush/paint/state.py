@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxbrush.canvas import OPACITY
 from jaxbrush.structs import config, state
 
 SOLVERS = ("zline_pcg", "jacobi_pcg", "chebyshev", "fixed_point")
@@ -113,7 +114,7 @@ def make_params(**changes) -> PaintParams:
         "deposit": 12.8, "squeeze": 0.4, "cling": 4.0, "pickup": 4.0, "exchange": 0.48,
         "exchange_depth": 0.125, "refill": 0.8, "soak": 10.0, "drag": 256.0, "lid": 0.9,
         "source": 1.0, "bound": 0.012, "yield_share": 0.02, "relax": 0.015625, "relax_slope": 0.752,
-        "opacity": 0.03,
+        "opacity": OPACITY,
     }  # fmt: skip
     unknown = set(changes) - set(values)
     if unknown:
