@@ -66,7 +66,7 @@ VARIANTS = {
         },
     },
     "color": _BOTH | {
-        "no new height": {"height": False}, "no recoloring": {"recolor": False},
+        "no new height": {"height": False},
         "a color, not shares": {"mixes": False},
         "a color, not recolored": {"mixes": False, "recolor": False},
     },

@@ -66,8 +66,8 @@ def make_batches(pairs: Pairs, options, kind: str = "height"):
     gather = jax.jit(lambda data, index: jax.tree.map(lambda x: x[index], data))
     # The paint knows no direction, so every pair is worth eight.
     turn = jax.jit(turned)
-    change = jax.jit(functools.partial(recolored, mixes=mixes(options, kind)))
-    recolor = kind != "height" and options.recolor
+    change = jax.jit(recolored)
+    recolor = kind != "height" and options.recolor and not mixes(options, kind)
 
     def batches(step: int):
         index = indices(options.seed, step, options.batch, len(pairs))

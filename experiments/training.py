@@ -76,7 +76,8 @@ class Options:
     """Color: the network says how much of which paint is seen, in place of a color as the paper's
     does."""
     recolor: bool = True
-    """Color: changes the colors of every pair at random, as paint allows (`batches.recolored`)."""
+    """Color, of a network that does not mix: changes the colors of every pair at random, as paint
+    allows (`batches.recolored`)."""
     resident: float = 4.0
     """Training pairs of up to so many GB are kept on the device, more are streamed."""
     seed: int = 0

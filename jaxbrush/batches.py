@@ -171,30 +171,26 @@ def single_batch(pairs: dict, mixes: bool = False, *told, **kwargs) -> Batch:
     )
 
 
-def recolored(batch: Batch, channels, scale, mixes: bool = False) -> Batch:
+def recolored(batch: Batch, channels, scale) -> Batch:
     """A batch of the color network, or of one for color and height, as if all had been painted in
     other colors.
 
     Paint mixes channel by channel, by the mean of a power of its absorption over scattering
     (`canvas.mix_subtractive`): to permute channels and to scale this ratio is exact, but where a
-    film is so thin that the ground shows through.
+    film is so thin that the ground shows through. A network that mixes is not shown colors, so it
+    has nothing to learn from others.
 
     Args:
       channels: (3,) a permutation. scale: (3,) factor on the ratio of each channel, before that.
-      mixes: whether the batch is one for a network that mixes.
     """
 
     def change(x):
         ratio = scale[None, None, None] * absorbed(from_srgb(0.5 * (x + 1.0)), 1.0)
         return _network(to_srgb(reflected(ratio, 1.0)))[..., channels]
 
-    if mixes:
-        *colors, rest = jnp.split(batch.inputs, (3, 6, 9), axis=-1)
-        colors = [change(x) for x in colors]
-    else:
-        before, stroke, rest = jnp.split(batch.inputs, (3, 6), axis=-1)
-        none = jnp.all(stroke == -1.0, axis=-1, keepdims=True)
-        colors = [change(before), jnp.where(none, -1.0, change(stroke))]
+    before, stroke, rest = jnp.split(batch.inputs, (3, 6), axis=-1)
+    none = jnp.all(stroke == -1.0, axis=-1, keepdims=True)
+    colors = [change(before), jnp.where(none, -1.0, change(stroke))]
     inputs = jnp.concatenate([*colors, rest], axis=-1)
     color, height = jnp.split(batch.target, (3,), axis=-1)
     target = jnp.concatenate([change(color), height], axis=-1)

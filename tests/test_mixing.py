@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from jaxbrush import mixing
-from jaxbrush.batches import network_height, recolored
+from jaxbrush.batches import network_height
 from jaxbrush.canvas import (
     LINEN,
     absorbed,
@@ -19,7 +19,6 @@ from jaxbrush.canvas import (
     to_srgb,
 )
 from jaxbrush.models import Generator, GeneratorConfig, inputs_of
-from jaxbrush.train import Batch
 
 SIDE = 16
 
@@ -38,6 +37,13 @@ def inputs_like(rng, more=6):
     maps = rng.uniform(-1.0, 1.0, (1, SIDE, SIDE, more))
     maps[..., [mixing.BEFORE - mixing.COLORS, -1]] = rng.uniform(-0.2, 1.0, (1, SIDE, SIDE, 2))
     return jnp.asarray(np.concatenate([colors, maps], -1), jnp.float32)
+
+
+def recolored(x, channels, scale):
+    """Colors (..., 3 n) as of other paints, for which mixtures are as true."""
+    colors = x.reshape(*x.shape[:-1], -1, 3)
+    ratio = scale * absorbed(from_srgb(0.5 * (colors + 1.0)), 1.0)
+    return (2.0 * to_srgb(reflected(ratio, 1.0)) - 1.0)[..., channels].reshape(x.shape)
 
 
 def logits_like(rng, spread=2.0):
@@ -94,13 +100,10 @@ def test_shares_do_not_depend_on_colors_so_other_colors_give_the_same_painting()
     inputs = inputs_like(rng)
     _, variables, run = network(True, inputs.shape[-1])
     found = run(variables, inputs)
-    batch = Batch(inputs=inputs, target=found, mask=inputs[..., :1])
-    channels, scale = np.array([2, 0, 1]), jnp.asarray([0.6, 1.5, 1.0])
-    other = recolored(batch, channels, scale, mixes=True)
-    np.testing.assert_allclose(run(variables, other.inputs), other.target, atol=1e-4)
-    # Only colors changed.
-    np.testing.assert_array_equal(other.inputs[..., 9:], inputs[..., 9:])
-    assert np.abs(other.inputs[..., :9] - inputs[..., :9]).max() > 0.1
+    paint = [2, 0, 1], jnp.asarray([0.6, 1.5, 1.0])[None, None, None, None]
+    other = inputs.at[..., : mixing.COLORS].set(recolored(inputs[..., : mixing.COLORS], *paint))
+    assert np.abs(other - inputs).max() > 0.1
+    np.testing.assert_allclose(run(variables, other), recolored(found, *paint), atol=1e-4)
 
 
 def test_two_paints_mix_as_the_simulators_pigments_do():
@@ -230,11 +233,11 @@ def test_one_network_for_color_and_height_mixes_the_color_alone():
     variables = run.init(jax.random.key(0), inputs)
     found = run.apply(variables, inputs)
     assert variables["params"]["decode4"]["kernel"].shape[3] == mixing.PAINTS + 1
-    batch = Batch(inputs=inputs, target=found, mask=inputs[..., :1])
-    channels, scale = np.array([1, 2, 0]), jnp.asarray([0.7, 1.4, 1.0])
-    other = recolored(batch, channels, scale, mixes=True)
-    np.testing.assert_allclose(run.apply(variables, other.inputs), other.target, atol=1e-4)
-    np.testing.assert_array_equal(other.target[..., 3], found[..., 3])
+    paint = [1, 2, 0], jnp.asarray([0.7, 1.4, 1.0])[None, None, None, None]
+    other = inputs.at[..., : mixing.COLORS].set(recolored(inputs[..., : mixing.COLORS], *paint))
+    again = run.apply(variables, other)
+    np.testing.assert_allclose(again[..., :3], recolored(found[..., :3], *paint), atol=1e-4)
+    np.testing.assert_array_equal(again[..., 3], found[..., 3])
 
 
 def test_low_precision_keeps_white_white():

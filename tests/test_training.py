@@ -86,6 +86,9 @@ def test_color_pairs_are_recolored_by_the_number_of_the_step():
     assert np.abs(first.target - plain.target).max() > 0.01
     assert np.abs(first.target - other.target).max() > 0.01
     np.testing.assert_array_equal(first.inputs[..., 6:], plain.inputs[..., 6:])
+    # One that mixes is not shown colors.
+    mixing = feed.make_batches(pairs, options, "color")(3)[0]
+    np.testing.assert_array_equal(mixing.target, plain.target)
 
 
 def test_pairs_are_turned_in_eight_ways_all_maps_alike():
