@@ -304,8 +304,10 @@ def make(name: str, shape, deeds: list[Deed], weights=SHIPPED, relief: float = R
     deep.
 
     Raises:
-      ValueError, OSError: weights that are not there, or none.
+      ValueError, OSError: weights that are not there, or none; a relief below 0.
     """
+    if not 0.0 <= relief < np.inf:
+        raise ValueError(f"relief = {relief}: expected >= 0 mm")
     if name == "neural":
         return Neural(painter.PainterConfig(relief=relief), painter.load_nets(*weights), shape)
     if name == "offline":

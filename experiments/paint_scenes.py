@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush
 from jaxbrush.canvas import mix_subtractive
-from jaxbrush.paint import PaintParams, for_brush, make_params
+from jaxbrush.paint import RELIEF, PaintParams, for_brush, make_params
 from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent
 from jaxbrush.stylus import Stroke, make_stroke, resample
 
@@ -182,8 +182,11 @@ SCENES = {
     "sea": ((264, 352), _sea),
 }  # fmt: skip
 """Size [pixels] and strokes of each sheet."""
-RELIEF = {"dry": 0.09}
-"""Depth of a sheet's weave [mm], where it is coarser than usual: a dry brush catches on it."""
+
+
+def relief_of(scene: str) -> float:
+    """Depth of a sheet's weave [mm]: coarser than usual where dry brushes are to catch on it."""
+    return 0.09 if scene == "dry" else RELIEF
 
 
 # shape, width, thickness, length, press depth [mm]: brushes such as the networks learned from

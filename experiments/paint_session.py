@@ -103,8 +103,7 @@ def main(options: Config) -> None:
     try:
         relief = options.relief
         if relief is None:
-            usual = {} if options.recording else paint_scenes.RELIEF
-            relief = usual.get(options.scene, RELIEF)
+            relief = RELIEF if options.recording else paint_scenes.relief_of(options.scene)
         session = read(options.recording, options.scene)
         side = np.asarray(session.canvas)[::-1] / engines.PIXEL
         shape = tuple(int(n) for n in options.pixels or np.ceil(side))

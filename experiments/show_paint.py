@@ -19,7 +19,7 @@ import tyro
 from rich.progress import track
 
 from experiments.common import console, helped, print_table, results_folder, write_run
-from experiments.paint_scenes import BRISTLES, NAMES, PALETTE, RELIEF, SCENES, brush_of, hand
+from experiments.paint_scenes import BRISTLES, NAMES, PALETTE, SCENES, brush_of, hand, relief_of
 from jaxbrush.brush import BrushConfig, rollout
 from jaxbrush.canvas import flatten
 from jaxbrush.paint import (
@@ -63,8 +63,7 @@ def total(config: PaintConfig, canvas, brush) -> float:
 
 def cloth(config: PaintConfig, name: str):
     """Weave (y, x) of a sheet [mm]."""
-    relief = {"depth": RELIEF[name]} if name in RELIEF else {}
-    return weave(SHAPE, config.pixel, **relief)
+    return weave(SHAPE, config.pixel, relief_of(name))
 
 
 def paint(config: PaintConfig, spacing: float, touches, name: str):

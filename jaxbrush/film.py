@@ -23,8 +23,6 @@ between the hairs is up to the flow: paint gathers where there is little hair. S
 the hair in the film is kept beside it, averaged over the last of the way.
 """
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -54,12 +52,12 @@ STANDS = 0.5
 """Share of the film in equilibrium that is not taken along. If all of it stands, a stroke on bare
 canvas has no ridge at its end, and networks have some 2 % more error; if none does, it is as with
 half, but the film trembles more with the stamps."""
-FULL = 1.3
-"""Times what a tip holds, up to which its coat grows, as in the simulator."""
 LIFTED = 0.5
 """Rate at which hair takes paint out of a film that is too thick, as a share of that at which it
 lays. These four were chosen among a dozen by the error of networks after 1,000 updates, on the 112
 test pairs of docs/networks.md."""
+FULL = 1.3
+"""Times what a tip holds, up to which its coat grows, as in the simulator."""
 
 
 @state
@@ -76,12 +74,12 @@ class Laid:
     behind: jax.Array
 
 
-def dipped(pixel: float, hairs, load, laid: Laid) -> Laid:
-    """A film with bristles that hold what a brush was loaded with and take nothing along; arguments
-    as in `laid_film`."""
-    most, least = (load * x for x in _holds(pixel, hairs))
-    none = jnp.zeros_like(laid.tip)
-    return dataclasses.replace(laid, taken=none, tip=none + most, behind=none + least)
+def dipped(pixel: float, height, bristles: int, hairs, load) -> Laid:
+    """A canvas (h, w) [mm] before a stroke, by bristles that hold what the brush was loaded with;
+    other arguments as in `laid_film`."""
+    none = jnp.zeros(bristles, height.dtype)
+    tip, behind = (none + load * most for most in _holds(pixel, hairs))
+    return Laid(film=height, hair=jnp.zeros_like(height), taken=none, tip=tip, behind=behind)
 
 
 def _holds(pixel: float, hairs):
@@ -111,8 +109,7 @@ def laid_film(grid: Grid, track: BristleTrack, hairs, load, height, relief=RELIE
       ValueError: a track of the tips alone.
     """
     bare = cut_canvas(height, _corner(grid)[None], grid.shape)[0]
-    each = jnp.zeros(track.position.shape[-1], bare.dtype)
-    begun = dipped(grid.pixel, hairs, load, Laid(bare, jnp.zeros_like(bare), each, each, each))
+    begun = dipped(grid.pixel, bare, track.position.shape[-1], hairs, load)
     laid = lay_on(grid, track, hairs, height.shape, begun, relief)
     return laid.film, laid.hair
 

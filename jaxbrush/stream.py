@@ -69,9 +69,9 @@ class Film:
         self.pixel, self.canvas = pixel, height.shape
         self.film = np.pad(np.asarray(height), BORDER, mode="edge")
         self.hair = np.zeros_like(self.film)
-        none = np.zeros(track.position.shape[-1], self.film.dtype)
-        laid = Laid(film=self.film, hair=self.hair, taken=none, tip=none, behind=none)
-        self.laid = jax.device_get(dipped(pixel, track.hairs[0], track.load[0], laid))
+        bristles = track.position.shape[-1]
+        # Of the stamps so far; what it says of pixels is that of the last rectangle.
+        self.laid = dipped(pixel, self.film[:1, :1], bristles, track.hairs[0], track.load[0])
 
     def add(self, track):
         """Goes on with the next stamps; the first is the last one of before, if there was one."""

@@ -13,7 +13,7 @@ from experiments import evaluate, make_dataset, train_network
 from jaxbrush import batches, checkpoint, data, pairs
 from jaxbrush.canvas import flatten, from_srgb, to_srgb
 from jaxbrush.models import Generator, GeneratorConfig
-from jaxbrush.paint import RELIEF, PaintConfig
+from jaxbrush.paint import RELIEF, PaintConfig, empty_canvas
 from jaxbrush.painter import HEIGHT_INPUTS
 from jaxbrush.train import Batch
 
@@ -246,6 +246,18 @@ def test_canvases_and_brushes_are_such_that_some_strokes_catch_on_the_weave():
     assert RELIEF < reliefs[~usual].min() and 0.08 < reliefs.max() <= options.relief
     loads = np.asarray([float(plan(0).load) for *_, plan in begun])
     assert 0.05 <= loads.min() and 0.05 < np.mean(loads < 0.25) < 0.3
+
+
+def test_the_weave_of_a_canvas_is_in_what_is_painted_and_in_what_is_told():
+    palette, _, plan = pairs._begun(SMALL, 0, 0)
+    dry = dataclasses.replace(plan(0), load=jnp.asarray(0.2, float))
+    bare = empty_canvas(SMALL.paint, (SMALL.size + 2 * pairs.MARGIN,) * 2)
+    smooth, deep = (
+        pairs._paint_pair(SMALL, dry, palette, jnp.asarray(relief, float), bare)[1]
+        for relief in (0.03, 0.1)
+    )
+    for name in ("new_height", "film"):
+        assert np.abs(getattr(smooth, name) - getattr(deep, name)).max() > 1e-3, name
 
 
 def test_some_canvases_are_painted_side_by_side():

@@ -33,6 +33,8 @@ def test_the_picture_that_comes_along_is_a_session_and_fills_its_canvas():
     assert len(strokes) == 34
     deeds = engines.deeds_of(session, (132, 176))
     assert len(deeds) == 34
+    with pytest.raises(ValueError, match="relief = -0.1"):
+        engines.make("realtime", (132, 176), deeds, relief=-0.1)
     place = np.concatenate([np.asarray(d.stroke.position) for d in deeds])
     # Half the pixels: half the size.
     assert np.abs(place.max(0) - 0.5 * np.asarray([43.0, 31.0])).max() < 1.0

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from jaxbrush.brush import BristleTrack
-from jaxbrush.film import ENDS, MEMORY, STANDS, WAKE, Laid, _meet, dipped, laid_film, lay_on
+from jaxbrush.film import ENDS, MEMORY, STANDS, WAKE, _meet, dipped, laid_film, lay_on
 from jaxbrush.paint import weave
 from jaxbrush.paint.state import make_params
 from jaxbrush.raster import make_grid
@@ -140,10 +140,8 @@ def test_a_brush_runs_dry_and_no_paint_is_made_or_lost():
     was dipped with, it lays as much at the end as before."""
     track = pulled(np.random.default_rng(0).uniform(1.2, 2.8, 40), start=0.5, length=7.5)
     height = BARE.at[8:24, 16:28].set(0.3)
-    none = jnp.zeros(40)
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    start = Laid(film=height, hair=BARE, taken=none, tip=none, behind=none)
-    begun = dipped(PIXEL, 1.0, 0.03, start)
+    begun = dipped(PIXEL, height, 40, 1.0, 0.03)
     laid = jax.jit(lay_on, static_argnums=3)(grid, track, 1.0, (32, 80), begun, 0.0)
     total = lambda x: sum(float(a.sum()) for a in (x.film, x.taken, x.tip, x.behind))  # noqa: E731
     assert total(laid) == pytest.approx(total(begun), rel=1e-6)
@@ -230,7 +228,7 @@ def test_points_close_at_the_tip_find_where_standing_hair_touches():
         return dataclasses.replace(track, position=position)
 
     def laid(ends):
-        with mock.patch("jaxbrush.film.ENDS", tuple(ends)):
+        with mock.patch.multiple("jaxbrush.film", ENDS=tuple(ends), make_params=endless):
             run = jax.jit(lambda track: laid_film(grid, track, 1.0, LOAD, BARE, 0.0)[0])
             return [np.asarray(run(leaning(angle))) for angle in (0.05, 0.8)]
 
@@ -240,7 +238,7 @@ def test_points_close_at_the_tip_find_where_standing_hair_touches():
         for f in (laid(ENDS), laid(np.linspace(0.0, 1.0, 5)))
     )
     print("flat, standing:", ours, even)
-    assert ours[1] < 0.12 and even[1] > 0.2
+    assert ours[1] < 0.12 and even[1] > 0.25
     assert max(ours) < 0.15
 
 
@@ -257,9 +255,7 @@ def test_what_hair_takes_along_stays_where_it_lifts():
     )  # fmt: skip
     wet = BARE + 0.3
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    none = jnp.zeros(60)
-    begun = Laid(film=wet, hair=BARE, taken=none, tip=none, behind=none)
-    begun = dipped(PIXEL, 1.0, LOAD, begun)
+    begun = dipped(PIXEL, wet, 60, 1.0, LOAD)
     track_of = lambda s: jax.tree.map(lambda x: x[s], track)  # noqa: E731
     until = lay_on(grid, track_of(slice(0, 61)), 1.0, (32, 80), begun, 0.0)
     laid = lay_on(grid, track_of(slice(60, n)), 1.0, (32, 80), until, 0.0)
@@ -280,10 +276,8 @@ def test_paint_that_is_taken_along_is_neither_made_nor_lost(monkeypatch):
     monkeypatch.setattr("jaxbrush.film.make_params", lambda: endless(deposit=0.0))
     track = pulled(np.random.default_rng(1).uniform(1.2, 2.8, 40), length=4.0)
     start = BARE + 0.3
-    none = jnp.zeros(40)
-    begun = Laid(film=start, hair=BARE, taken=none, tip=none, behind=none)
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    laid = lay_on(grid, track, 1.0, (32, 80), dipped(PIXEL, 1.0, LOAD, begun))
+    laid = lay_on(grid, track, 1.0, (32, 80), dipped(PIXEL, start, 40, 1.0, LOAD))
     assert float(laid.taken.sum()) > 1.0
     total = float(laid.film.sum() + laid.taken.sum())
     assert total == pytest.approx(float(start.sum()), rel=1e-6)
@@ -295,9 +289,7 @@ def test_a_stroke_in_pieces_is_as_the_whole():
     track = pulled(np.random.default_rng(0).uniform(0.2, 3.8, 40), start=-2.0, length=14.0)
     whole = both(track, height, relief=0.09, params=make_params)
     grid = make_grid((32, 80), (0.0, 0.0), PIXEL)
-    none = jnp.zeros(40)
-    laid = Laid(film=height, hair=BARE, taken=none, tip=none, behind=none)
-    laid = dipped(PIXEL, 1.0, LOAD, laid)
+    laid = dipped(PIXEL, height, 40, 1.0, LOAD)
     go = jax.jit(lay_on, static_argnums=3)
     for first in range(0, 140, 20):
         piece = jax.tree.map(lambda x, a=first: x[a : a + 21], track)

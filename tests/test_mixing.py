@@ -11,6 +11,7 @@ from jaxbrush import mixing
 from jaxbrush.batches import network_height
 from jaxbrush.canvas import (
     LINEN,
+    OPACITY,
     absorbed,
     flatten,
     from_srgb,
@@ -165,6 +166,12 @@ def test_bare_canvas_of_any_ground_stays_and_shows_through():
     rng = np.random.default_rng(8)
     inputs = inputs_like(rng).at[..., [mixing.BEFORE, -1]].set(-1.0)
     np.testing.assert_allclose(mix(logits_like(rng), inputs), inputs[..., :3], atol=1e-4)
+    # Through a film of the brush's paint.
+    film, brush = 0.02, jnp.full((1, SIDE, SIDE, mixing.PAINTS), -1e9).at[..., 0].set(0.0)
+    inputs = inputs.at[..., -1].set(network_height(film))
+    ground, paint = (from_srgb(0.5 * (inputs[..., k : k + 3] + 1.0)) for k in (0, 3))
+    want = paint + np.exp(-film / OPACITY) * (ground - paint)
+    np.testing.assert_allclose(mix(brush, inputs), 2.0 * to_srgb(want) - 1.0, atol=2e-3)
 
 
 def test_each_share_shows_its_own_paint():

@@ -187,6 +187,14 @@ def test_nothing_happens_between_an_empty_brush_and_a_bare_canvas():
     assert np.all(np.isfinite(np.asarray(report.residual)))
 
 
+def test_a_part_of_a_weave_is_that_of_the_whole():
+    whole = np.asarray(weave((40, 48), CONFIG.pixel, 0.09))
+    at = jnp.asarray([7, 21], jnp.int32)
+    part = jax.jit(lambda at: weave((16, 20), CONFIG.pixel, 0.09, first=(at[0], at[1])))(at)
+    np.testing.assert_allclose(part, whole[7:23, 21:41], atol=1e-6)
+    assert 0.0 <= whole.min() < 0.01 and 0.085 < whole.max() <= 0.09
+
+
 def test_a_dry_brush_paints_the_threads_of_a_coarse_weave_and_a_full_one_fills_it():
     """Naively hair follows the cloth, and lays more between the threads than on them; and film
     that flows at the speed of a whole cell is dragged off the threads again."""

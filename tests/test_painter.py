@@ -308,6 +308,20 @@ def test_the_pure_function_is_the_driver(monkeypatch):
     np.testing.assert_allclose(found.height, want.height, atol=2e-5)
 
 
+def test_networks_are_told_of_the_weave():
+    stroke = line(*PATHS["inside"])
+    films = []
+    for relief in (0.0, 0.09):
+        options = dataclasses.replace(OPTIONS, relief=relief)
+        track, bounds = painter._begin(options, BRUSH, stroke, 0.2)
+        box = painter.place(options, canvas().height.shape, bounds)
+        drawn, _ = painter.draw_on(options, box, canvas(), track, jnp.asarray(PAINT))
+        films.append(np.asarray(drawn.film))
+    assert np.abs(films[0] - films[1]).max() > 1e-3
+    with pytest.raises(ValueError, match="PainterConfig.relief = -0.1"):
+        dataclasses.replace(OPTIONS, relief=-0.1)
+
+
 @pytest.mark.slow
 def test_slope_from_canvas_to_stylus():
     """All the way, by the place of the samples. Soft maps jump where bristles of a stamp change

@@ -16,8 +16,9 @@ from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.session import Session
 
 OPTIONS = painter.PainterConfig(
-    brush=BrushConfig(nodes=4, track_nodes=2, approach=2), stamps=(1024,), sides=(64,)
-)
+    brush=BrushConfig(nodes=4, track_nodes=2, approach=2), stamps=(1024,), sides=(64,),
+    relief=0.09,
+)  # fmt: skip
 SHAPE = (230, 330)
 PAINT = np.asarray((0.1, 0.02, 0.5), np.float32)
 
@@ -99,6 +100,7 @@ def test_what_is_painted_early_is_what_is_painted_late(brush, before, kind):
     # A brush that comes back makes a patch anew; one that goes on does not.
     assert (again + len(late & set(early)) > 0) == (kind == "back")
     found = begun.result()
+    assert np.all(begun.track().relief == np.float32(OPTIONS.relief))
     after = painter.paint_track(OPTIONS, NETS, before, begun.track(), begun.bounds, PAINT)
     changed = np.asarray(after.height != before.height)
     assert changed.sum() > 2000
