@@ -46,14 +46,16 @@ _BOTH = {
     "width 1/8": {"width": 0.125},
     "width 1/2": {"width": 0.5},
     "no discriminator": {"gan": 0.0},
-    "the paper's 10 L1 : 1 cGAN": {"gan": 1.0},
-    "cGAN alone": {"l1": 0.0, "gan": 1.0},
+    "the paper's 10 L1 : 1 cGAN": {"gan": 1.0, "l2": 0.0, "opacity": 0.0},
+    "cGAN alone": {"l1": 0.0, "gan": 1.0, "l2": 0.0, "opacity": 0.0},
     "transposed convolution": {"upsampling": "transposed"},
     "no instance normalisation": {"norm": "none"},
     "no time map": {"time": False},
 }
 VARIANTS = {
     "height": _BOTH | {
+        "L1 alone, of heights": {"l2": 0.0, "opacity": 0.0},
+        "no difference of the light": {"opacity": 0.0},
         "no load": {"load": False},
         "no height of the tips": {"tip": False},
         "no film": {"film": False},

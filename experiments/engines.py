@@ -18,6 +18,7 @@ from scipy.optimize import nnls
 from jaxbrush import data, painter
 from jaxbrush.brush import BrushConfig, BrushParams, make_brush, rollout
 from jaxbrush.canvas import Canvas, absorbed, blank, flatten, reflected
+from jaxbrush.loaded import LOAD
 from jaxbrush.paint import (
     RELIEF,
     PaintConfig,
@@ -30,7 +31,6 @@ from jaxbrush.paint import (
     presets,
     weave,
 )
-from jaxbrush.pairs import LOAD
 from jaxbrush.raster.grid import bucket
 from jaxbrush.recordings import BrushEvent, ColorEvent, Session, StrokeEvent, to_stroke
 from jaxbrush.session import Session as Live

@@ -9,12 +9,14 @@ import numpy as np
 
 from jaxbrush import metrics
 from jaxbrush.canvas import from_srgb
+from jaxbrush.mixing import bare
 from jaxbrush.models import Generator, GeneratorConfig, inputs_of
 from jaxbrush.train import Batch, weights_of
 
 TOGETHER = 4  # pairs evaluated at once
 COLUMNS = {
-    "height": ("whole", "mask", "whole [0,1]", "mask [0,1]", "volume %", "normal °"),
+    "height": ("whole", "mask", "whole [0,1]", "mask [0,1]", "volume %", "normal °",
+               "light %"),
     "color": ("whole", "mask", "whole [0,1]", "mask [0,1]", "ΔE", "ΔE p95", "off hull %"),
 }  # fmt: skip
 
@@ -72,6 +74,7 @@ def _height(found, true, mask, inputs, scale: Scale):
         "volume": jnp.sum(mask[..., 0] * b),
         "excess": jnp.sum(mask[..., 0] * (a - b)),
         "normal": metrics.weighted_mean(angles, mask),
+        "light": metrics.weighted_mean(jnp.abs(bare(found) - bare(true))[..., 0], mask),
     }
 
 
@@ -108,10 +111,10 @@ def errors(kind: str, found, batch: Batch, scale: Scale) -> dict:
 
     Returns:
       Plain values. rmse_*: root of the mean over all pixels of all pairs, network scale, and image
-      scale [0, 1] at half of it. Height: volume_bias in the mask, normal angle [degrees]. Color:
-      CIEDE2000, p95 of which is the mean over pairs, and the share of pixels outside the hull, in
-      linear RGB, of background and brush. spectrum: power over the true one by octave, finest
-      first.
+      scale [0, 1] at half of it. Height, in the mask: volume_bias, normal angle [degrees], and the
+      mean difference of the light that comes through (`mixing.bare`). Color: CIEDE2000, p95 of
+      which is the mean over pairs, and the share of pixels outside the hull, in linear RGB, of
+      background and brush. spectrum: power over the true one by octave, finest first.
     """
     parts = []
     for first in range(0, len(found), TOGETHER):
@@ -133,6 +136,7 @@ def errors(kind: str, found, batch: Batch, scale: Scale) -> dict:
     if kind == "height":
         out["volume_bias"] = each["excess"].sum() / max(each["volume"].sum(), 1e-12)
         out["normal_angle"] = np.sum(area * each["normal"])
+        out["light"] = np.sum(area * each["light"])
     else:
         out["delta_e"] = np.sum(area * each["delta_e"])
         out["delta_e_p95"] = np.mean(each["delta_e_p95"])
@@ -195,6 +199,7 @@ def table(kind: str, rows: dict[str, dict]) -> tuple[list[str], list[list[str]]]
         text = [name] + [f"{row[m]:.4f}" for m in measures]
         if kind == "height":
             text += [f"{100 * row['volume_bias']:+.1f}", f"{row['normal_angle']:.2f}"]
+            text += [f"{100 * row['light']:.1f}"]
         else:
             text += [f"{row['delta_e']:.2f}", f"{row['delta_e_p95']:.2f}"]
             text += [f"{100 * row['out_of_hull']:.2f}"]

@@ -18,7 +18,7 @@ from experiments.common import console, print_table, results_folder, write_run
 from experiments.evaluation import Pairs, Scale
 from jaxbrush import checkpoint
 from jaxbrush.models import DiscriminatorConfig, GeneratorConfig, folded, inputs_of
-from jaxbrush.train import TrainConfig, inference_variables, make_params, make_train
+from jaxbrush.train import TrainConfig, TrainParams, inference_variables, make_params, make_train
 
 OUTPUTS = {"height": 1, "color": 3, "single": 4}
 """Channels of the networks; the single one paints color and height (paper Figure 6)."""
@@ -57,6 +57,10 @@ class Options:
     """Weight of the cGAN loss; 0 leaves the discriminator out. At the paper's 1 the discriminator
     wins within 2,000 steps of 1e-3, and its slope outweighs that of L1 by 15; at 0.1 within
     10,000."""
+    l2: float | None = None
+    """Weight of the mean squared difference [default: 200; of color networks 0]."""
+    opacity: float = 20.0
+    """Heights: weight of the difference of the light that comes through."""
     rate: float = 1e-3
     """Adam's learning rate of the generator."""
     discriminator_rate: float = 1e-4
@@ -112,6 +116,15 @@ def train_config(options: Options, kind: str) -> TrainConfig:
         judge if options.gan > 0.0 else None,
         options.average,
     )
+
+
+def train_params(options: Options, kind: str, factor: float = 1.0) -> TrainParams:
+    """The weights of losses that the options ask for, and a factor of their learning rates."""
+    l2 = options.l2
+    if l2 is None:
+        l2 = 0.0 if kind == "color" else 200.0
+    rates = (factor * options.rate, factor * options.discriminator_rate)
+    return make_params(options.l1, options.gan, *rates, l2=l2, opacity=options.opacity)
 
 
 def sample_grid(kind: str, found, pairs: Pairs, path: Path):
@@ -236,7 +249,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
     began = time.perf_counter()
     chosen = train_config(options, kind)
     init, update = make_train(chosen)
-    params = make_params(options.l1, options.gan, options.rate, options.discriminator_rate)
+    params = train_params(options, kind)
     batches = feed.make_batches(train, options, kind)
     held = jax.device_put(held)
     seconds = np.inf if options.minutes is None else 60.0 * options.minutes
@@ -290,9 +303,7 @@ def run(options: Options, kind: str, train: Pairs, held: Pairs, folder: Path):
                 batch, index = batches(step)
                 factor = falling(options.fall, spent(step))
                 if factor != used:
-                    rates = (factor * options.rate, factor * options.discriminator_rate)
-                    slower = make_params(options.l1, options.gan, *rates)
-                    slower = jax.device_put(slower, jax.devices()[0])
+                    slower = jax.device_put(train_params(options, kind, factor), jax.devices()[0])
                     state, used = dataclasses.replace(state, params=slower), factor
                 state, metrics = update(state, batch)
                 if pending is not None:

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxbrush.canvas import absorbed, from_srgb, reflected, to_srgb
+from jaxbrush.loaded import COAT
 from jaxbrush.mixing import COLORS, LEVEL
-from jaxbrush.pairs import COAT
 from jaxbrush.train import Batch
 
 LEVELS = {
@@ -66,6 +66,17 @@ def network_time(time):
     return _network(jnp.minimum(share, 1.0))
 
 
+THIN = 0.01
+"""[mm] of film up to which `network_thin` is about linear."""
+
+
+def network_thin(film):
+    """A film [mm] in network scale by its logarithm: of a dry brush it is hundredths of a
+    millimetre thin, which `network_height` hardly tells from none."""
+    share = jnp.log1p(jnp.maximum(film, 0.0) / THIN) / np.float32(np.log1p(LEVELS["film"] / THIN))
+    return _network(jnp.minimum(share, 1.0))
+
+
 HANDS = ("pressure", "sweeps", "both")
 
 
@@ -74,8 +85,8 @@ def height_batch(
     film: bool = True, hair: bool = True,
 ) -> Batch:  # fmt: skip
     """Inputs and target of the height network: background height, the hand, the way that the brush
-    had gone, its load, how high its hair was, the film that it would leave and the hair in that
-    film -> new height.
+    had gone, its load, how high its hair was, the film that it would leave, the hair in that film,
+    and the film once more on a scale for thin ones -> new height.
 
     Args:
       hand: what tells of the hand, one of HANDS: the pressure map as in the paper, the sweep count
@@ -108,6 +119,8 @@ def height_batch(
     if hair:
         part = jnp.asarray(pairs["hair"]) / LEVELS["hair"]
         parts.append(_network(jnp.minimum(part, 1.0)))
+    if film:
+        parts.append(network_thin(jnp.asarray(pairs["film"])))
     return Batch(
         inputs=jnp.concatenate(parts, axis=-1),
         target=network_height(jnp.asarray(pairs["new_height"])),

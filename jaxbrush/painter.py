@@ -14,8 +14,8 @@ import numpy as np
 from jaxbrush import checkpoint, patches
 from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
+from jaxbrush.loaded import LOAD, REACH
 from jaxbrush.models import inputs_of
-from jaxbrush.pairs import LOAD, REACH
 from jaxbrush.patches import Box, Layout, Rect
 from jaxbrush.raster import trajectory_maps
 from jaxbrush.stages import Nets as Nets
@@ -35,7 +35,7 @@ from jaxbrush.stages import (
 from jaxbrush.stages import paint_on as paint_on
 from jaxbrush.stylus import Stroke, stamps_needed
 
-HEIGHT_INPUTS, COLOR_INPUTS, MIXED_INPUTS = 8, 8, 15
+HEIGHT_INPUTS, COLOR_INPUTS, MIXED_INPUTS = 9, 8, 15
 """Channels that the networks are given: height, color, and color of one that mixes."""
 
 

@@ -6,8 +6,8 @@ import jax
 import numpy as np
 
 from jaxbrush.brush import BrushParams, advance, begin
+from jaxbrush.loaded import LOAD, loaded
 from jaxbrush.painter import PainterConfig
-from jaxbrush.pairs import LOAD, loaded
 from jaxbrush.stages import on_steps, touches
 from jaxbrush.stylus import Stroke, make_stroke
 

@@ -16,8 +16,8 @@ from jaxbrush import painter
 from jaxbrush.batches import PREVIEW_FILM
 from jaxbrush.brush import BrushParams
 from jaxbrush.canvas import Canvas
+from jaxbrush.loaded import LOAD
 from jaxbrush.painter import Nets, PainterConfig
-from jaxbrush.pairs import LOAD
 from jaxbrush.patches import Box
 from jaxbrush.pen import FIELDS, Pen, checked
 from jaxbrush.recordings import BrushEvent, ColorEvent, StrokeEvent

@@ -20,10 +20,10 @@ import numpy as np
 from jaxbrush import batches, patches, poisson
 from jaxbrush.brush import BristleTrack, BrushConfig, BrushParams, rollout
 from jaxbrush.canvas import Canvas, from_srgb, to_srgb
+from jaxbrush.loaded import LOAD, REACH, Loaded, drawn_maps, loaded, on_way
 from jaxbrush.metrics import image_scale
 from jaxbrush.models import Generator, GeneratorConfig
 from jaxbrush.paint import RELIEF
-from jaxbrush.pairs import LOAD, REACH, Loaded, drawn_maps, loaded, on_way
 from jaxbrush.patches import Box, Layout, PatchConfig, Rect
 from jaxbrush.raster import WIDTH, dilate
 from jaxbrush.structs import config, state

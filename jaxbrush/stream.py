@@ -15,8 +15,8 @@ import numpy as np
 from jaxbrush import painter, patches, stages
 from jaxbrush.canvas import Canvas
 from jaxbrush.film import Laid, dipped, lay_on
+from jaxbrush.loaded import REACH
 from jaxbrush.painter import Nets, PainterConfig
-from jaxbrush.pairs import REACH
 from jaxbrush.patches import PatchConfig, Rect
 
 PATCHES = PatchConfig(192, 80)

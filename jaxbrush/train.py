@@ -36,7 +36,7 @@ class Batch:
 
 @config
 class TrainConfig:
-    """discriminator: None trains by L1 alone, at half the cost of a weight of 0. average: keeps a
+    """discriminator: None trains without, at half the cost of a weight of 0. average: keeps a
     running average of the generator's parameters. beta1, beta2: of Adam."""
 
     generator: GeneratorConfig = GeneratorConfig()  # noqa: RUF009
@@ -48,21 +48,24 @@ class TrainConfig:
 
 @state
 class TrainParams:
-    """Scalars. l1, gan: weights of the generator's losses. generator_rate, discriminator_rate:
-    learning rates. decay: of the average of the parameters."""
+    """Scalars. l1, gan, l2, opacity: weights of the generator's losses; the last is for those that
+    paint heights. generator_rate, discriminator_rate: learning rates. decay: of the average of the
+    parameters."""
 
     l1: jax.Array
     gan: jax.Array
+    l2: jax.Array
+    opacity: jax.Array
     generator_rate: jax.Array
     discriminator_rate: jax.Array
     decay: jax.Array
 
 
 def make_params(
-    l1=10.0, gan=1.0, generator_rate=2e-4, discriminator_rate=2e-4, decay=0.999
+    l1=10.0, gan=1.0, generator_rate=2e-4, discriminator_rate=2e-4, decay=0.999, l2=0.0, opacity=0.0
 ) -> TrainParams:
     """The paper's weights and rates."""
-    values = (l1, gan, generator_rate, discriminator_rate, decay)
+    values = (l1, gan, l2, opacity, generator_rate, discriminator_rate, decay)
     return TrainParams(*(jnp.asarray(v, jnp.float32) for v in values))
 
 
@@ -133,12 +136,12 @@ def make_train(options: TrainConfig, mesh: Mesh | None = None):
       `init(key, batch, params=make_params()) -> TrainState`; of the batch only shapes count.
 
       `update(state, batch) -> (state, metrics)`, jitted; it consumes the state it is given. Metrics
-      are scalars of the state before the step: `l1`; with a discriminator `gan`, `discriminator`
-      (losses without weights), `accuracy` (share of patches told right, 1 where it has won),
-      `gradient_ratio` (of the weighted cGAN to the weighted L1 loss: norms of their slopes at the
-      picture) and `logit_spread` (standard deviation over patches, 0 where it has collapsed); norms
-      of the gradients `generator_slope`, `discriminator_slope`; `finite`, False once anything is
-      not.
+      are scalars of the state before the step: `l1`, `l2`, `opacity` of a network that paints
+      heights; with a discriminator `gan`, `discriminator` (losses without weights), `accuracy`
+      (share of patches told right, 1 where it has won), `gradient_ratio` (of the weighted cGAN to
+      the weighted others: norms of their slopes at the picture) and `logit_spread` (standard
+      deviation over patches, 0 where it has collapsed); norms of the gradients `generator_slope`,
+      `discriminator_slope`; `finite`, False once anything is not.
 
     Raises:
       ValueError: while tracing, a batch whose shapes or dtypes do not fit.
@@ -160,6 +163,12 @@ def make_train(options: TrainConfig, mesh: Mesh | None = None):
         w = weights(options.generator.norm, batch)
         variables = {"params": params, **moments}
         return generator.apply(variables, batch.inputs, w, train=True, mutable=["moments"])
+
+    def differ(fake, target, p):
+        found = {"l1": losses.l1(fake, target), "l2": losses.l2(fake, target)}
+        if options.generator.outputs != 3:
+            found["opacity"] = losses.opacity(fake[..., -1:], target[..., -1:])
+        return sum(getattr(p, name) * loss for name, loss in found.items()), found
 
     def init(key, batch: Batch, params: TrainParams | None = None) -> TrainState:
         _check(options, batch)
@@ -198,9 +207,7 @@ def make_train(options: TrainConfig, mesh: Mesh | None = None):
         fake, pull, moments = jax.vjp(
             lambda g: paint(g, state.moments, batch), state.generator, has_aux=True
         )
-        l1, slope = jax.value_and_grad(losses.l1)(fake, batch.target)
-        slope = p.l1 * slope
-        metrics = {"l1": l1}
+        (_, metrics), slope = jax.value_and_grad(differ, has_aux=True)(fake, batch.target, p)
         change = {}
         if playing:
             logits, pull_fake = jax.vjp(

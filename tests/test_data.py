@@ -118,7 +118,7 @@ def check_colors(p, inputs):
 def test_batches_are_in_network_scale(folder):
     p = data.load(folder).take("test", [0, 1])
     height = batches.height_batch(p)
-    assert height.inputs.shape == (2, 48, 48, 8) and height.target.shape == (2, 48, 48, 1)
+    assert height.inputs.shape == (2, 48, 48, 9) and height.target.shape == (2, 48, 48, 1)
     color = batches.color_batch(p)
     assert color.inputs.shape == (2, 48, 48, 8) and color.target.shape == (2, 48, 48, 3)
     assert batches.color_batch(p, time=False, height=False).inputs.shape[-1] == 6
@@ -137,6 +137,7 @@ def test_batches_are_in_network_scale(folder):
     np.testing.assert_allclose(
         height.inputs[..., 6:7], batches.network_height(p["film"]), atol=1e-6
     )
+    np.testing.assert_array_equal(height.inputs[..., 8:9], batches.network_thin(p["film"]))
     # Hair is only where it came, and some of it in the paint.
     hair = np.asarray(height.inputs[..., 7])
     assert np.all(p["hair"][p["mask"] == 0.0] == 0.0) and p["hair"].max() > 0.01
@@ -160,6 +161,11 @@ def test_batches_are_in_network_scale(folder):
     scaled = np.asarray(batches.network_time(jnp.asarray([0.0, 1.0, 2.0, 4.0, 64.0, 100.0])))
     assert scaled[0] == -1.0 and scaled[4] == scaled[5] == 1.0 and np.all(np.diff(scaled[:5]) > 0.0)
     np.testing.assert_array_equal(color.inputs[..., 6], batches.network_time(p["time"])[..., 0])
+    # A film of 10 um is told from none on one scale of films, and hardly on the other.
+    some = jnp.asarray([0.0, 0.01, 0.02, 0.3, 1.25, 2.0])
+    thin, thick = np.asarray(batches.network_thin(some)), np.asarray(batches.network_height(some))
+    assert thin[0] == -1.0 and thin[4] == thin[5] == 1.0 and np.all(np.diff(thin[:5]) > 0.1)
+    assert thin[1] - thin[0] > 0.25 and thick[1] - thick[0] < 0.02
     with pytest.raises(ValueError, match="hand = 'left'"):
         batches.height_batch(p, "left")
     for batch in (height, color, painted, mixes, *alone):

@@ -4,11 +4,38 @@ import numpy as np
 import pytest
 
 from jaxbrush import losses
+from jaxbrush.canvas import OPACITY
+from jaxbrush.mixing import LEVEL
 
 
 def test_l1_is_a_mean_over_everything():
     true = jnp.zeros((2, 4, 4, 3))
     assert float(losses.l1(true + 0.5, true)) == 0.5
+    assert float(losses.l2(true + 0.5, true)) == 0.25
+
+
+def test_least_squares_keep_the_paint_that_medians_miss():
+    """Of what is 0.1 in most places and 1.0 in a few: what one number fits best in either loss."""
+    true = jnp.where(jnp.arange(100) < 80, 0.1, 1.0)
+    tries = jnp.linspace(0.0, 1.0, 101)
+    best = []
+    for loss in (losses.l1, losses.l2):
+        best.append(tries[jnp.argmin(jax.vmap(loss, (0, None))(tries, true))])
+    np.testing.assert_allclose(best, [0.1, 0.28], atol=1e-6)
+    assert float(true.mean()) == pytest.approx(0.28)
+
+
+def test_opacity_counts_what_is_seen():
+    """10 um of paint more: a third of the light on a canvas that is nearly bare, nothing on a thick
+    film; less than no paint is none, and its slope is finite."""
+    height = lambda mm: jnp.full((1, 4, 4, 1), 2.0 * mm / LEVEL - 1.0)  # noqa: E731
+    light = [float(losses.opacity(height(h + 0.01), height(h))) for h in (0.0, 0.03, 0.3)]
+    through = [np.exp(-h / OPACITY) - np.exp(-(h + 0.01) / OPACITY) for h in (0.0, 0.03, 0.3)]
+    np.testing.assert_allclose(light, through, rtol=1e-3, atol=1e-7)
+    assert light[0] > 0.25 and light[2] < 1e-4
+    assert float(losses.opacity(height(-0.1), height(0.0))) == 0.0
+    for h in (-0.1, 0.0, 1.25):
+        assert np.isfinite(jax.grad(losses.opacity)(height(h), height(0.0))).all()
 
 
 def test_adversarial_losses_are_the_logarithms_of_the_paper(x64):

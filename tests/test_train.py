@@ -54,8 +54,9 @@ def separately(state, batch, compiled: bool):
     @jax.grad
     def for_generator(params):
         fake = paint(params)
-        loss = losses.fool(judge(state.discriminator, fake))
-        return 10.0 * losses.l1(fake, batch.target) + loss
+        loss = losses.fool(judge(state.discriminator, fake)) + 10.0 * losses.l1(fake, batch.target)
+        loss += 3.0 * losses.l2(fake, batch.target)
+        return loss + 2.0 * losses.opacity(fake, batch.target)
 
     @prepare
     @functools.partial(jax.grad, has_aux=True)
@@ -78,9 +79,11 @@ def separately(state, batch, compiled: bool):
 @pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_update_is_the_two_updates_written_separately(training, compiled):
     update, start = training
-    state, batch = start(), a_batch()
+    params = jax.device_put(make_params(l2=3.0, opacity=2.0), jax.devices()[0])
+    begin = lambda: dataclasses.replace(start(), params=params)  # noqa: E731
+    state, batch = begin(), a_batch()
     painter, judge, slopes, (right, spread) = separately(state, batch, compiled)
-    found, metrics = update(start(), batch)
+    found, metrics = update(begin(), batch)
     # Adam's first step is the sign of the slope times the rate, so slopes near 0 may differ.
     for ours, theirs, before in (
         (found.generator, painter, state.generator),
@@ -121,10 +124,14 @@ def test_one_compilation_serves_a_sweep_and_nothing_leaves_the_device(training):
     state, _ = update(state, batches[0])
     sweep = [
         jax.device_put(
-            make_params(l1=l1, gan=gan, generator_rate=rate, discriminator_rate=3 * rate),
+            make_params(l1, gan, rate, 3 * rate, l2=l2, opacity=l2),
             jax.devices()[0],
         )
-        for l1, gan, rate in ((10.0, 0.0, 1e-3), (0.0, 1.0, 1e-4), (100.0, 1.0, 0.0))
+        for l1, gan, rate, l2 in (
+            (10.0, 0.0, 1e-3, 0.0),
+            (0.0, 1.0, 1e-4, 3.0),
+            (9.0, 1.0, 0.0, 1.0),
+        )
     ]
     count = update._cache_size()
     with jax.transfer_guard("disallow"):
@@ -254,7 +261,7 @@ def test_l1_alone_is_a_cgan_weight_of_zero(training):
     for seed in range(3):
         state, _ = update(state, a_batch(seed))
         other, metrics = alone(other, a_batch(seed))
-    assert set(metrics) == {"l1", "generator_slope", "finite"}
+    assert set(metrics) == {"l1", "l2", "opacity", "generator_slope", "finite"}
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), state.generator, other.generator
     )

@@ -13,6 +13,8 @@ from experiments import evaluation, feed, training
 from experiments.evaluation import Pairs, Scale
 from experiments.training import Options
 from jaxbrush import checkpoint
+from jaxbrush.canvas import OPACITY
+from jaxbrush.mixing import LEVEL
 from jaxbrush.models import Generator
 from jaxbrush.train import Batch
 
@@ -47,6 +49,15 @@ def toy(count, side=32, seed=0, kind="height"):
         inputs = np.concatenate([background.repeat(3, -1), laid.repeat(3, -1), pressure, after], -1)
         background, after, preview = (x.repeat(count, -1) for x in (background, after, preview))
     return Pairs(Batch(scaled(inputs), scaled(after), mask), scaled(background), scaled(preview))
+
+
+def test_heights_are_taught_by_more_than_l1():
+    height, color = (training.train_params(Options(), kind, 0.5) for kind in ("height", "color"))
+    assert (float(height.l1), float(height.l2), float(height.opacity)) == (10.0, 200.0, 20.0)
+    assert float(color.l1) == 10.0 and float(color.l2) == 0.0
+    assert float(height.generator_rate) == pytest.approx(0.5 * Options().rate)
+    paper = training.train_params(Options(l2=0.0, opacity=0.0), "height")
+    assert float(paper.l2) == float(paper.opacity) == 0.0
 
 
 def test_every_pair_comes_once_an_epoch_and_order_is_a_function_of_the_step():
@@ -123,6 +134,9 @@ def test_errors_of_known_pictures():
     mask, mm = np.asarray(pairs.batch.mask), 0.5 * (truth + 1.0)
     assert more["volume_bias"] == pytest.approx(0.1 * mask.sum() / (mask * mm).sum(), rel=1e-4)
     assert more["normal_angle"] < 0.01
+    through = 1.0 - np.exp(-0.2 * 0.5 * LEVEL / OPACITY)
+    expected = through * (mask * np.exp(-mm * LEVEL / OPACITY)).sum() / mask.sum()
+    assert same["light"] == 0.0 and more["light"] == pytest.approx(expected, rel=1e-3)
 
 
 def test_color_errors_tell_false_colors():
