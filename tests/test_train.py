@@ -105,6 +105,27 @@ def test_update_is_the_two_updates_written_separately(training, compiled):
     assert bool(metrics["finite"]) and int(found.step) == 1
 
 
+@pytest.mark.parametrize("outputs", [3, 4])
+def test_light_is_that_through_heights_alone(outputs):
+    """Of a network of colors there is none; one of both has its height last."""
+    options = TrainConfig(GeneratorConfig(outputs, width=WIDTH, norm="none"), None)
+    init, update = make_train(options)
+    batch = a_batch(outputs=outputs)
+    state = init(jax.random.key(0), batch, make_params(0.0, 0.0, 1e-3, opacity=1.0))
+    variables, before = {"params": state.generator}, jax.tree.map(jnp.copy, state.generator)
+    fake = Generator(options.generator).apply(variables, batch.inputs)
+    state, metrics = update(state, batch)
+    change = jax.tree.map(lambda a, b: jnp.abs(a - b), state.generator, before)
+    last = change["decode4"]["bias"]
+    if outputs == 3:
+        assert "opacity" not in metrics
+        assert max(float(x.max()) for x in jax.tree.leaves(change)) == 0.0
+    else:
+        expected = losses.opacity(fake[..., 3:], batch.target[..., 3:])
+        assert float(metrics["opacity"]) == pytest.approx(float(expected), rel=1e-4)
+        assert float(last[:3].max()) == 0.0 and float(last[3]) > 0.0
+
+
 def test_average_follows_the_parameters(training):
     update, start = training
     state = start()
