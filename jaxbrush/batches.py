@@ -49,10 +49,15 @@ def network_pressure(pressure, touch):
     return _network(jnp.where(touch, TOUCH + (1.0 - TOUCH) * share, 0.0))
 
 
+def _logarithm(x, linear, most):
+    """[0, most] in network scale by its logarithm; about linear up to `linear`."""
+    share = jnp.log1p(jnp.maximum(x, 0.0) / linear) / np.float32(np.log1p(most / linear))
+    return _network(jnp.minimum(share, 1.0))
+
+
 def network_sweeps(sweeps):
     """Sweep count in network scale, by its logarithm: grooves follow it, most where it is low."""
-    share = jnp.log1p(jnp.maximum(sweeps, 0.0)) / np.float32(np.log1p(LEVELS["sweeps"]))
-    return _network(jnp.minimum(share, 1.0))
+    return _logarithm(sweeps, 1.0, LEVELS["sweeps"])
 
 
 WAY = 4.0
@@ -62,8 +67,7 @@ so that long strokes keep a slope and stay within what was learned."""
 
 def network_time(time):
     """The time map, the way of the brush [mm], in network scale."""
-    share = jnp.log1p(jnp.maximum(time, 0.0) / WAY) / np.float32(np.log1p(LEVELS["time"] / WAY))
-    return _network(jnp.minimum(share, 1.0))
+    return _logarithm(time, WAY, LEVELS["time"])
 
 
 THIN = 0.01
@@ -73,8 +77,7 @@ THIN = 0.01
 def network_thin(film):
     """A film [mm] in network scale by its logarithm: of a dry brush it is hundredths of a
     millimetre thin, which `network_height` hardly tells from none."""
-    share = jnp.log1p(jnp.maximum(film, 0.0) / THIN) / np.float32(np.log1p(LEVELS["film"] / THIN))
-    return _network(jnp.minimum(share, 1.0))
+    return _logarithm(film, THIN, LEVELS["film"])
 
 
 HANDS = ("pressure", "sweeps", "both")

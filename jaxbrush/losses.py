@@ -13,7 +13,7 @@ def l1(found, true):
 
 def l2(found, true):
     """Mean squared difference. What it makes is a mean, where L1 makes a median: heights are
-    skewed, so their medians miss paint (2 % of it, most of it in ridges)."""
+    skewed, so their medians miss paint (2 % of it, half of that where strokes end)."""
     return jnp.mean((found - true) ** 2)
 
 
