@@ -46,16 +46,17 @@ _BOTH = {
     "width 1/8": {"width": 0.125},
     "width 1/2": {"width": 0.5},
     "no discriminator": {"gan": 0.0},
-    "the paper's 10 L1 : 1 cGAN": {"gan": 1.0, "l2": 0.0, "opacity": 0.0},
-    "cGAN alone": {"l1": 0.0, "gan": 1.0, "l2": 0.0, "opacity": 0.0},
+    "the paper's 10 L1 : 1 cGAN": {"gan": 1.0, "l2": 0.0, "opacity": 0.0, "gradient": 0.0},
+    "cGAN alone": {"l1": 0.0, "gan": 1.0, "l2": 0.0, "opacity": 0.0, "gradient": 0.0},
     "transposed convolution": {"upsampling": "transposed"},
     "no instance normalisation": {"norm": "none"},
     "no time map": {"time": False},
 }
 VARIANTS = {
     "height": _BOTH | {
-        "L1 alone, of heights": {"l2": 0.0, "opacity": 0.0},
+        "L1 alone, of heights": {"l2": 0.0, "opacity": 0.0, "gradient": 0.0},
         "no difference of the light": {"opacity": 0.0},
+        "no difference of gradients": {"gradient": 0.0},
         "no load": {"load": False},
         "no height of the tips": {"tip": False},
         "no film": {"film": False},
@@ -68,6 +69,7 @@ VARIANTS = {
         },
     },
     "color": _BOTH | {
+        "mean squares, too": {"l2": 200.0},
         "no new height": {"height": False},
         "a color, not shares": {"mixes": False},
         "a color, not recolored": {"mixes": False, "recolor": False},

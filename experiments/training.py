@@ -61,6 +61,8 @@ class Options:
     """Weight of the mean squared difference [default: 200; of color networks 0]."""
     opacity: float = 20.0
     """Heights: weight of the difference of the light that comes through."""
+    gradient: float = 200.0
+    """Heights: weight of the squared difference of their gradients."""
     rate: float = 1e-3
     """Adam's learning rate of the generator."""
     discriminator_rate: float = 1e-4
@@ -124,7 +126,9 @@ def train_params(options: Options, kind: str, factor: float = 1.0) -> TrainParam
     if l2 is None:
         l2 = 0.0 if kind == "color" else 200.0
     rates = (factor * options.rate, factor * options.discriminator_rate)
-    return make_params(options.l1, options.gan, *rates, l2=l2, opacity=options.opacity)
+    return make_params(
+        options.l1, options.gan, *rates, l2=l2, opacity=options.opacity, gradient=options.gradient
+    )
 
 
 def sample_grid(kind: str, found, pairs: Pairs, path: Path):

@@ -37,6 +37,12 @@ MARGIN = 32
 """Pixels of canvas around what is kept, so that a stroke over its edge piles nothing up there."""
 DRY = 0.15
 """Share of strokes with a brush that holds next to nothing."""
+PULLED = 0.75
+"""Share of the canvases painted side by side whose strokes are pulled: the handle leans the way it
+goes, under a steady pressure. Hair then lies flat and keeps its place, and grooves last all along;
+a hand that leans one way whatever the stroke does, as that of `random_stroke`, hardly ever does it.
+Networks that saw it alone knew the finest grooves of such strokes (all of the sea's) to a
+correlation of 0.46, where the map of the hair has 0.76."""
 
 
 @config
@@ -217,7 +223,7 @@ def draw(options: PairConfig, key) -> Plan:
 def draw_beside(options: PairConfig, key, number: int) -> Plan:
     """Draws stroke `number` of a canvas that is painted as an area is: with one brush, in strokes
     side by side that overlap, some to and fro, and longer than those of `draw`, so that they cross
-    the canvas. Load, color and pressure are each stroke's own.
+    the canvas; most of them `PULLED`. Load, color and pressure are each stroke's own.
 
     Strokes at random hardly ever go along the edge of another. Networks that saw those alone left a
     band of the old color there, wider after more training.
@@ -236,7 +242,7 @@ def draw_beside(options: PairConfig, key, number: int) -> Plan:
 def _draw_beside(options: PairConfig, key, own, number, width, depth):
     """The stroke of `draw_beside`."""
     path, layout = jax.random.split(jax.random.fold_in(key, options.strokes + 1))
-    choice, gap, to_and_fro, *place = jax.random.uniform(layout, (5,))
+    choice, gap, to_and_fro, pull, *place = jax.random.uniform(layout, (6,))
     along, aside = jax.random.uniform(jax.random.fold_in(own, 0), (2,), minval=-0.1, maxval=0.1)
     side = options.size * options.paint.pixel
     # Straight, or an arc, or an S.
@@ -250,12 +256,22 @@ def _draw_beside(options: PairConfig, key, own, number, width, depth):
     away = (number - 0.5 * (options.strokes - 1)) * (0.3 + 0.6 * gap) + aside
     middle = side * (0.35 + 0.3 * jnp.stack(place)) + width * away * normal + side * along * chord
     back = (to_and_fro > 0.5) & (number % 2 == 1)
+    position = jnp.where(back, stroke.position[::-1], stroke.position)
+    heading = jnp.arctan2(chord[1], chord[0])
+    ahead = heading + jnp.where(back, np.pi, 0.0)
+    step = jnp.sqrt(jnp.sum(jnp.diff(position, axis=0) ** 2, axis=1) + 1e-12)
+    share = jnp.pad(jnp.cumsum(step), (1, 0)) / jnp.sum(step)
+    steady = jnp.minimum(1.0, jnp.minimum(share / 0.12, (1.0 - share) / 0.15))
+    pulled = pull < PULLED
     stroke = dataclasses.replace(
         stroke,
-        position=jnp.where(back, stroke.position[::-1], stroke.position),
-        pressure=hand.pressure,
+        position=position,
+        pressure=jnp.where(pulled, hand.pressure.max() * steady, hand.pressure),
+        altitude=jnp.where(pulled, stroke.altitude - 0.13, stroke.altitude),
+        # Around the way ahead, where it would be around 0.8.
+        azimuth=jnp.where(pulled, ahead + stroke.azimuth - 0.8, stroke.azimuth),
         # Its broad side ahead, more or less.
-        twist=jnp.arctan2(chord[1], chord[0]) + 0.5 * np.pi + 0.4 * stroke.twist,
+        twist=heading + 0.5 * np.pi + 0.4 * stroke.twist,
     )
     return _placed(options, stroke, depth, np.inf, middle, 0.0)
 

@@ -48,24 +48,26 @@ class TrainConfig:
 
 @state
 class TrainParams:
-    """Scalars. l1, gan, l2, opacity: weights of the generator's losses; the last is for those that
-    paint heights. generator_rate, discriminator_rate: learning rates. decay: of the average of the
-    parameters."""
+    """Scalars. l1, gan, l2, opacity, gradient: weights of the generator's losses; the last two are
+    for those that paint heights. generator_rate, discriminator_rate: learning rates. decay: of the
+    average of the parameters."""
 
     l1: jax.Array
     gan: jax.Array
     l2: jax.Array
     opacity: jax.Array
+    gradient: jax.Array
     generator_rate: jax.Array
     discriminator_rate: jax.Array
     decay: jax.Array
 
 
 def make_params(
-    l1=10.0, gan=1.0, generator_rate=2e-4, discriminator_rate=2e-4, decay=0.999, l2=0.0, opacity=0.0
-) -> TrainParams:
+    l1=10.0, gan=1.0, generator_rate=2e-4, discriminator_rate=2e-4, decay=0.999, l2=0.0,
+    opacity=0.0, gradient=0.0,
+) -> TrainParams:  # fmt: skip
     """The paper's weights and rates."""
-    values = (l1, gan, l2, opacity, generator_rate, discriminator_rate, decay)
+    values = (l1, gan, l2, opacity, gradient, generator_rate, discriminator_rate, decay)
     return TrainParams(*(jnp.asarray(v, jnp.float32) for v in values))
 
 
@@ -136,10 +138,11 @@ def make_train(options: TrainConfig, mesh: Mesh | None = None):
       `init(key, batch, params=make_params()) -> TrainState`; of the batch only shapes count.
 
       `update(state, batch) -> (state, metrics)`, jitted; it consumes the state it is given. Metrics
-      are scalars of the state before the step: `l1`, `l2`, `opacity` of a network that paints
-      heights; with a discriminator `gan`, `discriminator` (losses without weights), `accuracy`
-      (share of patches told right, 1 where it has won), `gradient_ratio` (of the weighted cGAN to
-      the weighted others: norms of their slopes at the picture) and `logit_spread` (standard
+      are scalars of the state before the step: `l1`, `l2`, `opacity` and `gradient` of a network
+      that paints heights; with a discriminator `gan`, `discriminator` (losses without weights),
+      `accuracy` (share of patches told right, 1 where it has won), `gradient_ratio` (of the
+      weighted cGAN to the weighted others: norms of their slopes at the picture) and
+      `logit_spread` (standard
       deviation over patches, 0 where it has collapsed); norms of the gradients `generator_slope`,
       `discriminator_slope`; `finite`, False once anything is not.
 
@@ -167,7 +170,8 @@ def make_train(options: TrainConfig, mesh: Mesh | None = None):
     def differ(fake, target, p):
         found = {"l1": losses.l1(fake, target), "l2": losses.l2(fake, target)}
         if options.generator.outputs != 3:
-            found["opacity"] = losses.opacity(fake[..., -1:], target[..., -1:])
+            for name in ("opacity", "gradient"):
+                found[name] = getattr(losses, name)(fake[..., -1:], target[..., -1:])
         return sum(getattr(p, name) * loss for name, loss in found.items()), found
 
     def init(key, batch: Batch, params: TrainParams | None = None) -> TrainState:

@@ -305,6 +305,29 @@ def test_some_canvases_are_painted_side_by_side():
         jax.tree.map(np.testing.assert_array_equal, mine, its)
 
 
+def test_most_strokes_side_by_side_are_pulled():
+    """Handle leaning the way it goes, pressure steady: in about `PULLED` of those canvases, for all
+    of their strokes, to and fro; where strokes are random hardly ever."""
+
+    def pulled(options, number):
+        _, _, plan = pairs._begun(options, 0, number)
+        found = []
+        for stroke in (plan(k).stroke for k in range(2)):
+            known = np.asarray(stroke.valid)
+            way = np.asarray(stroke.position)[known]
+            chord = way[-1] - way[0]
+            lean = np.asarray(stroke.azimuth)[known].mean() - np.arctan2(chord[1], chord[0])
+            press = np.asarray(stroke.pressure)[known]
+            found.append(np.cos(lean) > 0.8 and np.mean(press > 0.99 * press.max()) > 0.6)
+        return found
+
+    options = pairs.PairConfig()
+    beside = [pulled(options, number) for number in range(2, 44, 3)]
+    assert all(a == b for a, b in beside)
+    assert 0.5 < np.mean(beside) < 0.95
+    assert np.mean([pulled(options, number) for number in range(0, 24, 3)]) < 0.2
+
+
 def test_exported_networks_are_judged_on_any_data_set(folder, tmp_path, capsys):
     weights = []
     for kind, outputs, channels in (("height", 1, HEIGHT_INPUTS), ("color", 3, 15)):

@@ -25,6 +25,21 @@ def test_least_squares_keep_the_paint_that_medians_miss():
     assert float(true.mean()) == pytest.approx(0.28)
 
 
+def test_gradient_counts_what_light_sees():
+    """Grooves of 4 pixels and waves of 32 with the same error of heights: the grooves' slopes, and
+    their loss, are 50 times as large. A height that is off everywhere alike is none."""
+    x = jnp.arange(64.0)[None, None, :, None] * jnp.ones((1, 64, 1, 1))
+    flat = jnp.zeros_like(x)
+    fine, wide = (jnp.sin(2.0 * jnp.pi * x / wave + 0.25 * jnp.pi) for wave in (4.0, 32.0))
+    assert float(losses.l2(fine, flat)) == pytest.approx(float(losses.l2(wide, flat)), rel=1e-3)
+    steep = [float(losses.gradient(wave, flat)) for wave in (fine, wide)]
+    expected = [2.0 * np.sin(np.pi / wave) ** 2 for wave in (4.0, 32.0)]
+    np.testing.assert_allclose(steep, expected, rtol=0.02)
+    assert float(losses.gradient(flat + 0.3, flat)) == 0.0
+    turned = losses.gradient(fine.swapaxes(1, 2), flat)
+    assert float(turned) == pytest.approx(steep[0], rel=1e-5)
+
+
 def test_opacity_counts_what_is_seen():
     """10 um of paint more: a third of the light on a canvas that is nearly bare, nothing on a thick
     film; less than no paint is none, and its slope is finite."""

@@ -56,7 +56,7 @@ def separately(state, batch, compiled: bool):
         fake = paint(params)
         loss = losses.fool(judge(state.discriminator, fake)) + 10.0 * losses.l1(fake, batch.target)
         loss += 3.0 * losses.l2(fake, batch.target)
-        return loss + 2.0 * losses.opacity(fake, batch.target)
+        return loss + 2.0 * losses.opacity(fake, batch.target) + losses.gradient(fake, batch.target)
 
     @prepare
     @functools.partial(jax.grad, has_aux=True)
@@ -79,7 +79,7 @@ def separately(state, batch, compiled: bool):
 @pytest.mark.parametrize("compiled", [True, pytest.param(False, marks=pytest.mark.slow)])
 def test_update_is_the_two_updates_written_separately(training, compiled):
     update, start = training
-    params = jax.device_put(make_params(l2=3.0, opacity=2.0), jax.devices()[0])
+    params = jax.device_put(make_params(l2=3.0, opacity=2.0, gradient=1.0), jax.devices()[0])
     begin = lambda: dataclasses.replace(start(), params=params)  # noqa: E731
     state, batch = begin(), a_batch()
     painter, judge, slopes, (right, spread) = separately(state, batch, compiled)
@@ -106,23 +106,24 @@ def test_update_is_the_two_updates_written_separately(training, compiled):
 
 
 @pytest.mark.parametrize("outputs", [3, 4])
-def test_light_is_that_through_heights_alone(outputs):
+def test_light_is_that_through_and_from_heights_alone(outputs):
     """Of a network of colors there is none; one of both has its height last."""
     options = TrainConfig(GeneratorConfig(outputs, width=WIDTH, norm="none"), None)
     init, update = make_train(options)
     batch = a_batch(outputs=outputs)
-    state = init(jax.random.key(0), batch, make_params(0.0, 0.0, 1e-3, opacity=1.0))
+    state = init(jax.random.key(0), batch, make_params(0.0, 0.0, 1e-3, opacity=1.0, gradient=1.0))
     variables, before = {"params": state.generator}, jax.tree.map(jnp.copy, state.generator)
     fake = Generator(options.generator).apply(variables, batch.inputs)
     state, metrics = update(state, batch)
     change = jax.tree.map(lambda a, b: jnp.abs(a - b), state.generator, before)
     last = change["decode4"]["bias"]
     if outputs == 3:
-        assert "opacity" not in metrics
+        assert not {"opacity", "gradient"} & metrics.keys()
         assert max(float(x.max()) for x in jax.tree.leaves(change)) == 0.0
     else:
-        expected = losses.opacity(fake[..., 3:], batch.target[..., 3:])
-        assert float(metrics["opacity"]) == pytest.approx(float(expected), rel=1e-4)
+        for name in ("opacity", "gradient"):
+            expected = getattr(losses, name)(fake[..., 3:], batch.target[..., 3:])
+            assert float(metrics[name]) == pytest.approx(float(expected), rel=1e-4)
         assert float(last[:3].max()) == 0.0 and float(last[3]) > 0.0
 
 
@@ -145,7 +146,7 @@ def test_one_compilation_serves_a_sweep_and_nothing_leaves_the_device(training):
     state, _ = update(state, batches[0])
     sweep = [
         jax.device_put(
-            make_params(l1, gan, rate, 3 * rate, l2=l2, opacity=l2),
+            make_params(l1, gan, rate, 3 * rate, l2=l2, opacity=l2, gradient=l2),
             jax.devices()[0],
         )
         for l1, gan, rate, l2 in (
@@ -282,7 +283,7 @@ def test_l1_alone_is_a_cgan_weight_of_zero(training):
     for seed in range(3):
         state, _ = update(state, a_batch(seed))
         other, metrics = alone(other, a_batch(seed))
-    assert set(metrics) == {"l1", "l2", "opacity", "generator_slope", "finite"}
+    assert set(metrics) == {"l1", "l2", "opacity", "gradient", "generator_slope", "finite"}
     jax.tree.map(
         lambda a, b: np.testing.assert_allclose(a, b, atol=2e-5), state.generator, other.generator
     )

@@ -54,10 +54,11 @@ def toy(count, side=32, seed=0, kind="height"):
 def test_heights_are_taught_by_more_than_l1():
     height, color = (training.train_params(Options(), kind, 0.5) for kind in ("height", "color"))
     assert (float(height.l1), float(height.l2), float(height.opacity)) == (10.0, 200.0, 20.0)
+    assert float(height.gradient) == 200.0
     assert float(color.l1) == 10.0 and float(color.l2) == 0.0
     assert float(height.generator_rate) == pytest.approx(0.5 * Options().rate)
-    paper = training.train_params(Options(l2=0.0, opacity=0.0), "height")
-    assert float(paper.l2) == float(paper.opacity) == 0.0
+    paper = training.train_params(Options(l2=0.0, opacity=0.0, gradient=0.0), "height")
+    assert float(paper.l2) == float(paper.opacity) == float(paper.gradient) == 0.0
 
 
 def test_every_pair_comes_once_an_epoch_and_order_is_a_function_of_the_step():
