@@ -19,8 +19,8 @@ def l2(found, true):
 
 def gradient(found, true):
     """Mean squared difference of the differences between neighbours along both axes (of Mathieu et
-    al. 2016, squared): what light sees of two pictures of heights. Fine grooves are a tenth of the
-    heights' variance and most of their gradient's."""
+    al. 2016, squared): what light sees of two pictures of heights. What is finer than a Gaussian of
+    2.5 pixels is 7 % of their variance in the masks of test pairs, and 63 % of their gradients'."""
     apart = found - true
     return jnp.mean(jnp.diff(apart, axis=1) ** 2) + jnp.mean(jnp.diff(apart, axis=2) ** 2)
 

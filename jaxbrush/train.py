@@ -142,9 +142,8 @@ def make_train(options: TrainConfig, mesh: Mesh | None = None):
       that paints heights; with a discriminator `gan`, `discriminator` (losses without weights),
       `accuracy` (share of patches told right, 1 where it has won), `gradient_ratio` (of the
       weighted cGAN to the weighted others: norms of their slopes at the picture) and
-      `logit_spread` (standard
-      deviation over patches, 0 where it has collapsed); norms of the gradients `generator_slope`,
-      `discriminator_slope`; `finite`, False once anything is not.
+      `logit_spread` (standard deviation over patches, 0 where it has collapsed); norms of the
+      gradients `generator_slope`, `discriminator_slope`; `finite`, False once anything is not.
 
     Raises:
       ValueError: while tracing, a batch whose shapes or dtypes do not fit.
