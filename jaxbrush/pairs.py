@@ -42,7 +42,7 @@ PULLED = 0.75
 goes, under a steady pressure. Hair then lies flat and keeps its place, and grooves last all along;
 a hand that leans one way whatever the stroke does, as that of `random_stroke`, hardly ever does it.
 Networks that saw it alone knew the finest grooves of such strokes (all of the sea's) to a
-correlation of 0.46, where the map of the hair has 0.76."""
+correlation of 0.46, where the map of the hair has -0.76."""
 
 
 @config
