@@ -21,7 +21,7 @@ from jaxbrush.paint import PaintConfig
 from jaxbrush.pairs import PairConfig, Picture, canvas_pairs, canvases_pairs
 from jaxbrush.structs import config
 
-FORMAT = 13
+FORMAT = 14
 FULL = 65535
 CHANNELS = (
     ("height", 1), ("color", 3), ("pressure", 1), ("sweeps", 1), ("trajectory", 3), ("time", 1),

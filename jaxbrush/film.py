@@ -210,17 +210,22 @@ def lay_on(
                 moving.append(inside & (y >= 0) & (y < canvas[0]) & (x >= 0) & (x < canvas[1]))
         cell = jnp.stack(cells)
         under, gap_there = film[cell], gap[cell]
-        touch = jnp.clip((reach - (high[None] - under)) / reach, 0.0, 1.0)
+        share, on = jnp.stack(shares), jnp.stack(moving)
+        moves = jnp.where(on, share, 0.0)
+        # A point on a hair meets what is under it between the middles of columns, of the canvas
+        # alone, so that all grids see the same.
+        amount = jnp.sum(moves, axis=0, keepdims=True)
+        amount = jnp.where(amount > 0.0, amount, 1.0)
+        mean = lambda x: jnp.sum(moves * x, axis=0, keepdims=True) / amount  # noqa: E731
+        here, low_here = mean(under), mean(gap_there)
+        touch = jnp.clip((reach - (high[None] - here)) / reach, 0.0, 1.0)
         # A coat bridges gaps between threads only as far as it is thick.
-        touch = touch * (1.0 - jnp.clip((gap_there - under) / coat, 0.0, 1.0))
+        touch = touch * (1.0 - jnp.clip((low_here - here) / coat, 0.0, 1.0))
         above = high[None] + gap_there
-        share = jnp.stack(shares)
         there = share * touch * each[None]
-        even = jnp.maximum(above + 0.7 * coat - radius, 0.0)
+        even = jnp.maximum(high[None] + low_here + 0.7 * coat - radius, 0.0)
         sunk = jnp.clip((under - above) / (2.0 * radius) + 0.5, 0.0, 1.0)
         within = share * volume * sunk
-        on = jnp.stack(moving)
-        moves = jnp.where(on, share, 0.0)
         swept = moves * wake[None] * sunk
         # All along the hair, ahead of its tip, while any of it touches.
         lets = jnp.minimum(jnp.sum(moves * touch, axis=(0, 1)), 1.0)

@@ -35,8 +35,10 @@ from jaxbrush.stylus import Stroke, random_stroke, resample, transform
 SHAPES = ("flat", "filbert", "round")
 MARGIN = 32
 """Pixels of canvas around what is kept, so that a stroke over its edge piles nothing up there."""
-DRY = 0.15
-"""Share of strokes with a brush that holds next to nothing."""
+DRY, DRY_BESIDE = 0.15, 0.35
+"""Share of strokes with a brush that holds next to nothing, and of those painted side by side: dry
+brushes are pulled, too, and leave the streaks of single hairs, which networks that hardly saw any
+such stroke painted as a tint."""
 PULLED = 0.75
 """Share of the canvases painted side by side whose strokes are pulled: the handle leans the way it
 goes, under a steady pressure. Hair then lies flat and keeps its place, and grooves last all along;
@@ -193,7 +195,7 @@ def _make_brush(options: PairConfig, name: str, key):
 
 
 @jax.jit
-def _draw_load(options: PairConfig, key):
+def _draw_load(options: PairConfig, key, dry: float):
     """The mix and the load of `draw`, as `Plan` has them."""
     *_, color, load = jax.random.split(key, 6)
     first, second, blend = jax.random.split(color, 3)
@@ -207,7 +209,7 @@ def _draw_load(options: PairConfig, key):
     choice, least = jax.random.uniform(jax.random.fold_in(load, 1), (2,))
     return (
         (1.0 - share) * pick(first) + share * pick(second),
-        jnp.where(choice < DRY, 0.05 + 0.2 * least, full),
+        jnp.where(choice < dry, 0.05 + 0.2 * least, full),
     )
 
 
@@ -215,7 +217,7 @@ def draw(options: PairConfig, key) -> Plan:
     """Draws one stroke: brush, hand, load and color."""
     hand = jax.random.split(key, 6)[3]
     brush, paint, _ = _draw_brush(options, key)
-    mix, load = _draw_load(options, key)
+    mix, load = _draw_load(options, key, DRY)
     stroke = _draw_stroke(options, hand, brush.press_depth)
     return Plan(stroke=stroke, brush=brush, paint=paint, mix=mix, load=load)
 
@@ -234,7 +236,7 @@ def draw_beside(options: PairConfig, key, number: int) -> Plan:
     own = jax.random.fold_in(key, number + 1)
     brush, paint, width = _draw_brush(options, jax.random.fold_in(key, 1))
     stroke = _draw_beside(options, key, own, number, width, brush.press_depth)
-    mix, load = _draw_load(options, own)
+    mix, load = _draw_load(options, own, DRY_BESIDE)
     return Plan(stroke=stroke, brush=brush, paint=paint, mix=mix, load=load)
 
 

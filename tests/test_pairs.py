@@ -90,3 +90,10 @@ def test_most_strokes_side_by_side_are_pulled():
     assert all(a == b for a, b in beside)
     assert 0.5 < np.mean(beside) < 0.95
     assert np.mean([pulled(options, number) for number in range(0, 24, 3)]) < 0.2
+
+
+def test_a_third_of_the_strokes_side_by_side_are_dry():
+    options = pairs.PairConfig()
+    plans = [pairs._begun(options, 0, number)[2] for number in range(2, 62, 3)]
+    loads = np.asarray([float(plan(k).load) for plan in plans for k in range(2)])
+    assert 0.2 < np.mean(loads < 0.25) < 0.55 and loads.min() >= 0.05
