@@ -11,7 +11,9 @@ Bristles run dry as they do there: each holds what the brush was loaded with, la
 what it lifts, and is refilled from behind. A dry one has a thin coat, lays little, and on a coarse
 weave reaches the threads alone. With a coat as thick as at first everywhere the film is 96 µm off
 the simulator (rms in the masks of those strokes), with this 77; where the brush holds next to
-nothing 66 and 34.
+nothing 66 and 34. What a point on a hair touches it is told by the canvas and the film between the
+middles of columns, as there: where each column tells for itself, dry strokes have the lattice of
+the threads and no streaks, and all films are 5 % farther off (77.5 µm for 74 on 112 strokes).
 
 A brush is full of paint that moves with it, two to four times as high as the film it leaves, the
 more the longer it goes over wet paint, and where it lifts that stays as a ridge. No network that
