@@ -169,6 +169,24 @@ def test_a_dry_brush_paints_the_threads_of_a_coarse_weave_and_a_full_one_fills_i
     assert full[1] > full[0]
 
 
+def test_a_dry_hair_leaves_its_line_between_columns_over_threads_and_gaps():
+    """What hair reaches is asked where it is, between the middles of columns, as in the simulator.
+    Naively, each column for itself, those that are deeper than its coat is thick get none: dry
+    strokes were the lattice of the threads, without streaks."""
+    load, relief, count = 0.16, 0.09, 0
+    coat = float(P.hair_radius * (P.coat_dry + P.coat_full * load))
+    gap = relief - np.asarray(weave((32, 80), PIXEL, relief))
+    for row in range(12, 20):
+        track = pulled([row * PIXEL] * 9)  # on the edge between two rows
+        found = np.asarray(film(track, BARE, load=load, relief=relief, **STILL))
+        laid, deep = found[row - 1 : row + 1, 24:48], gap[row - 1 : row + 1, 24:48]
+        beside = (deep.max(0) > coat) & (deep.min(0) < 0.5 * coat) & (deep.mean(0) < 0.9 * coat)
+        assert np.all(laid[:, beside].min(0) > 0.8 * laid[:, beside].max(0))
+        assert np.all(laid[:, beside] > 0.01)
+        count += beside.sum()
+    assert count > 20
+
+
 def test_hair_in_the_film_has_the_volume_that_is_there():
     # Hair that stays long enough in deep paint: its volume but for the taper, 0.75 on average.
     track = pulled([1.5, 2.5], length=0.0, start=3.0)
