@@ -36,9 +36,8 @@ SHAPES = ("flat", "filbert", "round")
 MARGIN = 32
 """Pixels of canvas around what is kept, so that a stroke over its edge piles nothing up there."""
 DRY, DRY_BESIDE = 0.15, 0.35
-"""Share of strokes with a brush that holds next to nothing, and of those painted side by side: dry
-brushes are pulled, too, and leave the streaks of single hairs, which networks that hardly saw any
-such stroke painted as a tint."""
+"""Share of strokes with a brush that holds next to nothing, and of those painted side by side: with
+one share for all, not one stroke in 25 was dry and pulled, as those are that show single hairs."""
 PULLED = 0.75
 """Share of the canvases painted side by side whose strokes are pulled: the handle leans the way it
 goes, under a steady pressure. Hair then lies flat and keeps its place, and grooves last all along;

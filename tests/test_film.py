@@ -161,11 +161,11 @@ def test_a_dry_brush_paints_the_threads_of_a_coarse_weave_and_a_full_one_fills_i
         found = np.asarray(film(track, BARE, load=load, relief=relief, **STILL))[11:21, 24:48]
         return found[cloth > 0.07].mean(), found[cloth < 0.02].mean()
 
-    threads, between = films(0.1, 0.09)
+    threads, between = films(0.08, 0.09)
     naive = films(0.25, 0.0)
     full = films(0.8, 0.09)
     print("film on threads and between [mm]:", threads, between, naive, full)
-    assert threads > 2.5 * between and naive[0] < 1.3 * naive[1]
+    assert threads > 3.0 * between and naive[0] < 1.3 * naive[1]
     assert full[1] > full[0]
 
 
@@ -248,7 +248,7 @@ def test_points_close_at_the_tip_find_where_standing_hair_touches():
     def laid(ends):
         with mock.patch.multiple("jaxbrush.film", ENDS=tuple(ends), make_params=endless):
             run = jax.jit(lambda track: laid_film(grid, track, 1.0, LOAD, BARE, 0.0)[0])
-            return [np.asarray(run(leaning(angle))) for angle in (0.05, 0.8)]
+            return [np.asarray(run(leaning(angle))) for angle in (0.05, 0.7, 0.8, 0.9)]
 
     many = laid(np.linspace(0.0, 1.0, 33))
     ours, even = (
@@ -256,7 +256,7 @@ def test_points_close_at_the_tip_find_where_standing_hair_touches():
         for f in (laid(ENDS), laid(np.linspace(0.0, 1.0, 5)))
     )
     print("flat, standing:", ours, even)
-    assert ours[1] < 0.12 and even[1] > 2.0 * ours[1]
+    assert np.mean(ours[1:]) < 0.12 and np.mean(even[1:]) > 0.25
     assert max(ours) < 0.15
 
 

@@ -264,36 +264,18 @@ def test_networks_see_what_they_were_trained_on():
 SOFT = dataclasses.replace(OPTIONS, edge=0.25, stamps=(16,), cells=(2,))
 
 
-def check_slope(error, step):
-    """Of error(shift), which is (value, more), at 0 by finite differences; returns more. Networks
-    have kinks, so that of both sides the nearer is taken."""
-    error = jax.jit(jax.value_and_grad(error, has_aux=True))
-    (here, more), slope = error(jnp.zeros(()))
-    (ahead, _), _ = error(jnp.asarray(step))
-    (behind, _), _ = error(jnp.asarray(-step))
-    assert np.isfinite(slope) and abs(slope) > 0.1
-    sides = np.asarray([ahead - here, 0.5 * (ahead - behind), here - behind]) / step
-    nearest = sides[np.argmin(np.abs(sides - slope))]
-    np.testing.assert_allclose(nearest, slope, rtol=0.05, err_msg=f"{sides}")
-    return more
-
-
-def weighted_sum(after):
-    weight = jnp.asarray(np.random.default_rng(1).normal(size=(64, 64)), jnp.float32)
-    return jnp.sum(weight * (after.height + after.color[..., 0]))
-
-
 def test_the_pure_function_is_the_driver(monkeypatch):
     """And has a slope, here by the color of the paint."""
     before, stroke = canvas(), jax.tree.map(jnp.asarray, line(*PATHS["inside"]))
     sizes, first = painter.plan(OPTIONS, before, BRUSH, stroke)
     way = jnp.asarray([0.5, 1.0, 0.7])  # along which slopes do not cancel
+    weight = jnp.asarray(np.random.default_rng(1).normal(size=(64, 64)), jnp.float32)
 
     def error(shift):
         after, ok = painter.paint_on(
             OPTIONS, sizes, NETS, before, BRUSH, jnp.asarray(PAINT) + shift * way, stroke, first
         )
-        return jnp.where(ok, weighted_sum(after), jnp.nan), after
+        return jnp.where(ok, jnp.sum(weight * (after.height + after.color[..., 0])), jnp.nan), after
 
     # Compiled as a whole, rounding moves single bristles by a step of `on_steps`, which networks
     # would show (8e-5 mm): the places are compared to a step, what is painted on the same ones.
@@ -305,7 +287,15 @@ def test_the_pure_function_is_the_driver(monkeypatch):
     step = OPTIONS.pixel / stages.STEPS
     np.testing.assert_allclose(own.position, track.position, atol=1.01 * step)
     monkeypatch.setattr(stages, "trace", lambda *_: track)
-    found = check_slope(error, 2.5e-4)
+    error = jax.jit(jax.value_and_grad(error, has_aux=True))
+    (_, found), _ = error(jnp.zeros(()))
+    # Networks have kinks: a difference is the mean of the slopes between.
+    step, places = 2.5e-4, 32
+    between = step * (2.0 * (np.arange(places) + 0.5) / places - 1.0)
+    slopes = np.asarray([error(jnp.asarray(x, jnp.float32))[1] for x in between])
+    ahead, behind = (error(jnp.asarray(x, jnp.float32))[0][0] for x in (step, -step))
+    assert np.all(np.isfinite(slopes)) and np.all(np.abs(slopes) > 0.1)
+    np.testing.assert_allclose((ahead - behind) / (2.0 * step), slopes.mean(), rtol=0.05)
     want = painter.paint_stroke(OPTIONS, NETS, before, BRUSH, PAINT, stroke)
     np.testing.assert_allclose(found.color, want.color, atol=2e-5)
     np.testing.assert_allclose(found.height, want.height, atol=2e-5)
